@@ -1,0 +1,1 @@
+"""Parametric bodies in SMPL's file format, and linear blend skinning."""

@@ -1,0 +1,45 @@
+"""Names to places. Plain dictionaries of strings, imported by nobody's side effect: ``load`` imports on demand."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+METHODS: dict[str, str] = {
+    "rs-avatar": "rsavatar.methods.rolling:RollingShutterAvatar",
+    "gauhuman": "rsavatar.methods.oblivious:ShutterObliviousAvatar",
+    "mad-avatar": "rsavatar.methods.blur:BlurAvatar",
+}
+
+MOTIONS: dict[str, str] = {
+    "frame-spline": "rsavatar.motion.spline:FrameSpline",
+    "still": "rsavatar.motion.still:StillPose",
+}
+
+DATASETS: dict[str, str] = {
+    "rolling": "rsavatar.data.rolling:load",
+    "zju": "rsavatar.data.zju:load",
+}
+
+METRICS: dict[str, str] = {
+    "psnr": "rsavatar.metrics.image:psnr",
+    "ssim": "rsavatar.metrics.image:ssim",
+    "flip": "rsavatar.metrics.image:flip",
+    "lpips": "rsavatar.metrics.image:lpips",
+}
+
+DESCRIPTIONS: dict[str, str] = {
+    "rs-avatar": "rolling-shutter model: every row rendered at its own instant (ours)",
+    "gauhuman": "shutter-oblivious: one pose per frame, as if the frame were instantaneous",
+    "mad-avatar": "blur model: the same spline and the same T renders, averaged instead of selected",
+}
+
+
+def load(table: dict[str, str], name: str) -> Any:
+    """Import the object that ``table`` names.
+
+    Raises:
+        KeyError: if ``name`` is not in ``table``; specs and requests are validated long before.
+    """
+    module, _, attribute = table[name].partition(":")
+    return getattr(importlib.import_module(module), attribute)

@@ -1,0 +1,1 @@
+"""Datasets: every loader returns a ``Subject``."""

@@ -1,0 +1,45 @@
+"""The exception tree of the core. Every message reads: name, expected, got.
+
+RsAvatarError
+├── SpecError         a job description is unknown, malformed or contradicts itself
+├── DataError         a subject, image, mask, fit or camera is missing, truncated or in the wrong unit
+├── BodyError         a body model file cannot be used
+├── CheckpointError   a checkpoint is damaged, or belongs to another spec or code version
+├── KernelError       the native kernels are missing, or refused their input
+└── DivergedError     training left the finite numbers and could not be brought back
+"""
+
+from __future__ import annotations
+
+
+class RsAvatarError(Exception):
+    """Base of all errors that this package raises on purpose."""
+
+
+class SpecError(RsAvatarError):
+    """A job description is unknown, malformed or contradicts itself."""
+
+
+class DataError(RsAvatarError):
+    """A subject, image, mask, fit or camera cannot be used."""
+
+
+class BodyError(RsAvatarError):
+    """A body model file cannot be used."""
+
+
+class CheckpointError(RsAvatarError):
+    """A checkpoint is damaged, or belongs to another spec or code version."""
+
+
+class KernelError(RsAvatarError):
+    """The native kernels are missing, or refused their input."""
+
+
+class DivergedError(RsAvatarError):
+    """Training left the finite numbers and could not be brought back."""
+
+
+def expected(name: str, wanted: object, got: object) -> str:
+    """The one shape of a message about a bad value: ``name: expected WANTED, got GOT``."""
+    return f"{name}: expected {wanted}, got {got}"

@@ -1,0 +1,1 @@
+"""One renderer entry point over slots: native kernels, and a slow float64 twin in torch."""

@@ -1,0 +1,1 @@
+"""Shutters: an image is a schedule of rows."""

@@ -1,0 +1,71 @@
+"""Shutters by their slots: instant, blur, row bands, scanline, and scanline with exposure (design table 1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from rsavatar.errors import SpecError, expected
+from rsavatar.shutter.base import AbstractShutter, Slot
+
+
+@dataclass(frozen=True)
+class Instant(AbstractShutter):
+    """Global shutter: the whole image at the mid time (paper, table "Shutter regimes", first row)."""
+
+    def slots(self, height: int, readout: float, trigger: float) -> tuple[Slot, ...]:
+        return (Slot(0, height, trigger),)
+
+
+@dataclass(frozen=True)
+class Blur(AbstractShutter):
+    """MAD-Avatar's operator: the mean of ``instants`` whole images over the readout (paper, eq. blur)."""
+
+    instants: int
+
+    def slots(self, height: int, readout: float, trigger: float) -> tuple[Slot, ...]:
+        times = _band_times(self.instants, readout, trigger)
+        return tuple(Slot(0, height, t, weight=1.0 / self.instants) for t in times)
+
+
+@dataclass(frozen=True)
+class Bands(AbstractShutter):
+    """The paper's operator: band i from the render at its middle instant (paper, eqs. bandtime and rs_discrete).
+
+    Band i holds the rows ceil((i-1) H / T) <= v < ceil(i H / T); with T > H some bands are empty and left out.
+    """
+
+    bands: int
+
+    def slots(self, height: int, readout: float, trigger: float) -> tuple[Slot, ...]:
+        times = _band_times(self.bands, readout, trigger)
+        edges = [-(-i * height // self.bands) for i in range(self.bands + 1)]
+        return tuple(Slot(lo, hi, t) for lo, hi, t in zip(edges, edges[1:], times, strict=False) if hi > lo)
+
+
+@dataclass(frozen=True)
+class Scanline(AbstractShutter):
+    """The continuous rolling shutter: row v at its own instant (paper, eqs. rowtime and rs).
+
+    ``exposure`` (a fraction of the readout) adds blur: each row is the mean of ``samples`` scans shifted over the
+    exposure. ``direction`` "up" reads from the last row to the first.
+    """
+
+    exposure: float = 0.0
+    samples: int = 1
+    direction: Literal["down", "up"] = "down"
+
+    def slots(self, height: int, readout: float, trigger: float) -> tuple[Slot, ...]:
+        rate = readout / height
+        start = trigger - readout / 2
+        if self.direction == "up":
+            rate, start = -rate, start + rate * (height - 1)
+        shifts = _band_times(self.samples, self.exposure * readout, 0.0)
+        return tuple(Slot(0, height, start + s, rate, 1.0 / self.samples) for s in shifts)
+
+
+def _band_times(count: int, readout: float, trigger: float) -> list[float]:
+    """t_i = (i - 1/2) / T * readout, centred on the trigger; i = 1..T (paper, eq. bandtime)."""
+    if count < 1:
+        raise SpecError(expected("instants", "at least 1", count))
+    return [trigger + readout * ((i + 0.5) / count - 0.5) for i in range(count)]

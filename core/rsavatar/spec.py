@@ -1,0 +1,144 @@
+"""What a job is: one frozen, validated, torch-free ``JobSpec``, and the presets it starts from.
+
+A request names what it cares about (``method``, ``subject``, perhaps ``T``); ``resolve`` lays it over the preset's
+file in ``core/experiments`` and returns the complete spec. The complete spec is what is stored, hashed and run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from rsavatar.catalog import METHODS
+from rsavatar.errors import SpecError, expected
+
+Preset = Literal["smoke", "draft", "paper"]
+Bands = Annotated[int, Field(ge=1, le=8192)] | Annotated[str, Field(pattern=r"^([2-9]|[1-9][0-9])?K$|^scanline$")]
+
+SELECTING_METHODS = frozenset({"rs-avatar", "oracle"})  # methods whose shutter selects rows
+FLAGS_OF_METHOD: dict[str, frozenset[str]] = {  # the components that a method has, so can lose
+    "rs-avatar": frozenset({"no_rs", "no_spline", "no_pose_deformation", "no_lbs_refinement", "no_reg"}),
+    "mad-avatar": frozenset({"no_spline", "no_pose_deformation", "no_lbs_refinement", "no_reg"}),
+    "gauhuman": frozenset({"no_pose_deformation", "no_lbs_refinement"}),
+}
+
+
+class Ablation(BaseModel):
+    """One flag per component of the method; each removes exactly that component (paper, table "Ablations")."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    no_rs: bool = Field(False, description="no rolling-shutter model: the readout time is taken as 0")
+    no_spline: bool = Field(False, description="one pose per frame instead of an intra-frame trajectory")
+    no_pose_deformation: bool = Field(False, description="no residual pose network")
+    no_lbs_refinement: bool = Field(False, description="no learned offset on the skinning weights")
+    no_reg: bool = Field(False, description="no inter-frame continuity penalty")
+
+    def flags(self) -> tuple[str, ...]:
+        """Names of the flags that are set, in declaration order."""
+        return tuple(name for name in type(self).model_fields if getattr(self, name))
+
+
+class JobSpec(BaseModel):
+    """A reconstruction job, complete. Two equal specs on equal data and code give bit-identical results.
+
+    Raises:
+        pydantic.ValidationError: on unknown fields, values out of range, or values that contradict each other;
+            ``resolve`` turns it into a ``SpecError``.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+
+    method: str = Field(description="reconstruction method; see the catalogue")
+    subject: str = Field(min_length=1, max_length=128, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", description="subject")
+    preset: Preset = Field("draft", description="where the unnamed values come from")
+    K: int | None = Field(None, ge=1, le=1000, description="source frames per output frame; none = the subject's own")
+    T: Bands | None = Field(None, description="row bands: an integer, K, 2K, 4K, or scanline; none = K")
+    P: int = Field(4, ge=2, le=8, description="control points per frame; the trajectory has degree P - 1")
+    lambda_reg: float = Field(1.0, ge=0, le=1e4, alias="lambda", description="weight of the continuity penalty")
+    ablation: Ablation = Field(default_factory=Ablation, description="components to remove")
+    iterations: int = Field(20_000, ge=1, le=1_000_000, description="optimiser steps, one frame of one camera each")
+    seed: int = Field(0, ge=0, lt=2**31, description="seed of every random choice")
+    priority: int = Field(0, ge=-10, le=10, description="higher runs earlier; does not change the result")
+
+    body: str = Field("auto", max_length=1024, description="auto, anny, or a path to an SMPL-format .npz or .pkl")
+    continuity: Literal["aligned", "paper"] = Field("aligned", description="instants that L_reg compares")
+    perturbation: Literal["zero-mean", "positive"] = Field("zero-mean", description="noise on initial control points")
+    sh_degree: int = Field(1, ge=0, le=1, description="highest spherical-harmonics degree of the colours")
+    mask_weight: float = Field(0.1, ge=0, le=10, description="weight of the L1 between opacity and body mask")
+    densify: bool = Field(True, description="adaptive density control: clone, split, prune")
+    checkpoint_every: int = Field(1000, ge=1, description="steps between checkpoints")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.method not in METHODS:
+            raise ValueError(expected("method", f"one of {', '.join(METHODS)}", repr(self.method)))
+        alien = sorted(set(self.ablation.flags()) - FLAGS_OF_METHOD.get(self.method, frozenset()))
+        if alien:
+            has = ", ".join(sorted(FLAGS_OF_METHOD.get(self.method, frozenset()))) or "no flags"
+            raise ValueError(expected("ablation", f"components that {self.method} has ({has})", ", ".join(alien)))
+        if self.T == "scanline" and self.method == "mad-avatar":
+            raise ValueError(expected("T", "a finite number of renders for mad-avatar to average", "'scanline'"))
+        return self
+
+    def bands(self, source_frames: int) -> int | Literal["scanline"]:
+        """``T`` as a number (or ``"scanline"``) once ``K = source_frames`` is known."""
+        if self.T is None:
+            return source_frames
+        if isinstance(self.T, int):
+            return self.T
+        return "scanline" if self.T == "scanline" else int(self.T[:-1] or 1) * source_frames
+
+    def sha256(self) -> str:
+        """Content hash of everything that decides the result (``priority`` does not)."""
+        text = json.dumps(self.model_dump(mode="json", exclude={"priority"}), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def presets_dir() -> Path:
+    """Folder of the preset files: inside an installed package, or ``core/experiments`` of a checkout."""
+    here = Path(__file__).resolve().parent
+    return next((d for d in (here / "experiments", here.parent / "experiments") if d.is_dir()), here / "experiments")
+
+
+def read_preset(name: str) -> dict[str, Any]:
+    """The values of one preset file.
+
+    Raises:
+        SpecError: if there is no such preset.
+    """
+    names = sorted(p.stem for p in presets_dir().glob("*.toml"))
+    if name not in names:
+        raise SpecError(expected("preset", f"one of {', '.join(names)}", repr(name)))
+    with (presets_dir() / f"{name}.toml").open("rb") as file:
+        return tomllib.load(file)
+
+
+def resolve(request: Mapping[str, Any]) -> JobSpec:
+    """Lay a partial request over its preset and validate the whole.
+
+    A preset's ``T`` speaks of the rolling-shutter model, so it is not laid under methods that do not select rows.
+
+    Raises:
+        SpecError: naming every offending field with what was expected and what was got.
+    """
+    preset = read_preset(str(request.get("preset", "draft")))
+    if request.get("method") not in SELECTING_METHODS:
+        preset.pop("T", None)
+    try:
+        return JobSpec.model_validate({**preset, **{k: v for k, v in request.items() if v is not None}})
+    except ValidationError as error:
+        raise SpecError("; ".join(_sentence(e) for e in error.errors())) from None
+
+
+def _sentence(error: Any) -> str:
+    where = ".".join(str(part) for part in error["loc"])
+    if not where:  # raised by _consistent: already name, expected, got
+        return str(error["msg"]).removeprefix("Value error, ")
+    return expected(where, error["msg"].lower(), repr(error["input"]))
