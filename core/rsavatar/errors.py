@@ -6,7 +6,8 @@ RsAvatarError
 ├── BodyError         a body model file cannot be used
 ├── CheckpointError   a checkpoint is damaged, or belongs to another spec or code version
 ├── KernelError       the native kernels are missing, or refused their input
-└── DivergedError     training left the finite numbers and could not be brought back
+├── DivergedError     training left the finite numbers and could not be brought back
+└── Interrupted       somebody asked the job to stop; its checkpoint is on disk
 """
 
 from __future__ import annotations
@@ -38,6 +39,10 @@ class KernelError(RsAvatarError):
 
 class DivergedError(RsAvatarError):
     """Training left the finite numbers and could not be brought back."""
+
+
+class Interrupted(RsAvatarError):
+    """Somebody asked the job to stop; its checkpoint is on disk."""
 
 
 def expected(name: str, wanted: object, got: object) -> str:
