@@ -1,0 +1,153 @@
+"""Pictures on disk: which there are, how large, what they hold; undistortion."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image as Pillow
+
+from rsavatar.data.base import Array, Bytes, Image
+from rsavatar.errors import DataError, expected
+
+SUFFIXES = (".png", ".jpg", ".jpeg")
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Intrinsics and distortion (k1, k2, p1, p2, k3) as OpenCV takes them.
+
+    **Convention**: ``matrix`` is OpenCV's, for pixel centres at WHOLE integers; both images keep that matrix.
+    """
+
+    matrix: Array  # [3, 3]
+    distortion: Array  # [5]
+
+    @property
+    def distorts(self) -> bool:
+        """False when undistorting would copy the image."""
+        return bool(np.any(self.distortion != 0))
+
+    def undistorted(self, image: Bytes) -> Bytes:
+        """The image an ideal pinhole camera of the same matrix would have taken (bilinear, black outside)."""
+        if not self.distorts:
+            return image
+        return np.asarray(cv2.undistort(image, self.matrix, self.distortion), np.uint8)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Where one picture and its mask lie."""
+
+    image: Path
+    mask: Path
+
+
+Frames = Mapping[tuple[str, int], Frame]  # by (camera name, frame index)
+
+
+def numbered(directory: Path) -> dict[int, Path]:
+    """Pictures of a folder by the number that their name is (``000012.png`` -> 12); others are passed over.
+
+    Raises:
+        DataError: if the folder is missing.
+    """
+    if not directory.is_dir():
+        raise DataError(expected(str(directory), "a folder of numbered images", "nothing there"))
+    found = sorted(path for path in directory.iterdir() if path.suffix.lower() in SUFFIXES and path.stem.isdecimal())
+    return {int(path.stem): path for path in found}
+
+
+def locate(images: Path, masks: Path, indices: Iterable[int]) -> list[Frame]:
+    """The frames ``indices`` of one camera, every file known to be there.
+
+    Raises:
+        DataError: naming the first missing image or mask.
+    """
+    pictures, covers = numbered(images), numbered(masks)
+    frames = []
+    for index in indices:
+        for folder, found in ((images, pictures), (masks, covers)):
+            if index not in found:
+                raise DataError(expected(str(folder / f"{index:06d}.png"), "an image", "nothing there"))
+        frames.append(Frame(pictures[index], covers[index]))
+    return frames
+
+
+def size_of(path: Path) -> tuple[int, int]:
+    """(height, width) from the file's header.
+
+    Raises:
+        DataError: if it is not an image.
+    """
+    try:
+        with Pillow.open(path) as picture:
+            return picture.height, picture.width
+    except (OSError, SyntaxError, ValueError) as error:
+        raise DataError(expected(str(path), "an image file", error)) from error
+
+
+def read_rgb(path: Path) -> Bytes:
+    """Colour image [H, W, 3], RGB, 0..255.
+
+    Raises:
+        DataError: if the file is missing, truncated or not an image.
+    """
+    return _decoded(path, colour=True)
+
+
+def read_coverage(path: Path) -> Bytes:
+    """Mask [H, W], 0..255, 0 where nobody is. Labels (a mask whose largest value is 1) become 0 and 255.
+
+    Raises:
+        DataError: if the file is missing, truncated or not an image.
+    """
+    values = _decoded(path, colour=False)
+    if values.ndim == 3:
+        values = values[..., :3].max(-1)
+    if values.dtype != np.uint8 or values.max(initial=0) <= 1:
+        return np.where(values != 0, 255, 0).astype(np.uint8)
+    return values
+
+
+def read_frame(frame: Frame, lens: Lens) -> Image:
+    """Undistorted colours and coverage of one picture, black where the coverage is 0.
+
+    Raises:
+        DataError: if a file cannot be decoded, or image and mask differ in size.
+    """
+    colours, coverage = read_rgb(frame.image), read_coverage(frame.mask)
+    if colours.shape[:2] != coverage.shape:
+        raise DataError(expected(f"size of {frame.mask}", colours.shape[:2], coverage.shape))
+    colours, coverage = lens.undistorted(colours), lens.undistorted(coverage)
+    return np.where(coverage[..., None] != 0, colours, 0).astype(np.uint8), coverage
+
+
+def fingerprint(root: Path, paths: Iterable[Path]) -> str:
+    """sha256 over the names (relative to ``root``) and contents of files, in the order of their names.
+
+    Raises:
+        DataError: if a file cannot be read.
+    """
+    digest = hashlib.sha256()
+    for path in sorted(set(paths)):
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise DataError(expected(str(path), "a readable file", error)) from error
+        digest.update(f"{path.relative_to(root).as_posix()}\0{len(content)}\0".encode())
+        digest.update(content)
+    return digest.hexdigest()
+
+
+def _decoded(path: Path, colour: bool) -> Bytes:
+    # Pillow, because OpenCV hands back the upper half of a truncated file without a word.
+    try:
+        with Pillow.open(path) as picture:
+            return np.asarray(picture.convert("RGB") if colour else picture)
+    except (OSError, SyntaxError, ValueError) as error:
+        raise DataError(expected(str(path), "a complete image file", error)) from error
