@@ -51,15 +51,17 @@ Frames = Mapping[tuple[str, int], Frame]  # by (camera name, frame index)
 
 
 def numbered(directory: Path) -> dict[int, Path]:
-    """Pictures of a folder by the number that their name is (``000012.png`` -> 12); others are passed over.
+    """Pictures of a folder by the frame number in their name; other files are passed over.
+
+    ``000012.png`` is 12, and so is a name whose fifth field between underscores is ``0012``: ZJU-MoCap has both.
 
     Raises:
         DataError: if the folder is missing.
     """
     if not directory.is_dir():
         raise DataError(expected(str(directory), "a folder of numbered images", "nothing there"))
-    found = sorted(path for path in directory.iterdir() if path.suffix.lower() in SUFFIXES and path.stem.isdecimal())
-    return {int(path.stem): path for path in found}
+    pictures = sorted(path for path in directory.iterdir() if path.suffix.lower() in SUFFIXES)
+    return {number: path for path in pictures if (number := _number(path.stem)) is not None}
 
 
 def locate(images: Path, masks: Path, indices: Iterable[int]) -> list[Frame]:
@@ -127,21 +129,33 @@ def read_frame(frame: Frame, lens: Lens) -> Image:
     return np.where(coverage[..., None] != 0, colours, 0).astype(np.uint8), coverage
 
 
-def fingerprint(root: Path, paths: Iterable[Path]) -> str:
-    """sha256 over the names (relative to ``root``) and contents of files, in the order of their names.
+def fingerprint(root: Path, contents: Iterable[Path], sizes: Iterable[Path] = ()) -> str:
+    """sha256 over files, in the order of their names relative to ``root``.
+
+    Of ``contents`` every byte counts; of ``sizes`` (sequences of gigabytes) the name and the length only.
 
     Raises:
         DataError: if a file cannot be read.
     """
     digest = hashlib.sha256()
-    for path in sorted(set(paths)):
+    whole = set(contents)
+    for path in sorted(whole | set(sizes)):
         try:
-            content = path.read_bytes()
+            length = path.stat().st_size
+            content = path.read_bytes() if path in whole else b""
         except OSError as error:
             raise DataError(expected(str(path), "a readable file", error)) from error
-        digest.update(f"{path.relative_to(root).as_posix()}\0{len(content)}\0".encode())
+        digest.update(f"{path.relative_to(root).as_posix()}\0{length}\0".encode())
         digest.update(content)
     return digest.hexdigest()
+
+
+def _number(stem: str) -> int | None:
+    fields = stem.split("_")
+    for text in (stem, fields[4] if len(fields) > 4 else ""):
+        if text.isdecimal():
+            return int(text)
+    return None
 
 
 def _decoded(path: Path, colour: bool) -> Bytes:

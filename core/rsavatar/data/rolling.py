@@ -1,6 +1,6 @@
 """Rolling-shutter subjects: ``meta.json``, ``rs/`` and, for synthetic ones, ``truth/``.
 
-meta.json            mid, K, gamma, train, test; optional excluded, delta, pixel_centre
+meta.json            mid, K, gamma, train, test; optional excluded, delta, pixel_centre (default 0)
 rs/annots.npy        calibration, T in millimetres
 rs/images/<cc>/<nnnnnn>.png  rs/mask/...     what the training cameras saw; mask != 0 is the person
 rs/gt/<cc>/...       rs/gt_mask/...          sharp frames at the mid-row time of all listed cameras

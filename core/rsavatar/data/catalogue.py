@@ -1,0 +1,46 @@
+"""Which subject a name and a folder mean."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rsavatar.catalog import DATASETS
+from rsavatar.catalog import load as load_named
+from rsavatar.data.base import Subject
+from rsavatar.errors import DataError, expected
+
+STUDIO = "studio"
+_LAYOUTS = "meta.json with rs/ (rolling), or annots.npy with images/ or Camera_B1.. (zju)"
+
+
+def open_subject(name: str, directory: Path | None) -> Subject:
+    """The subject in ``directory``; without one, ``name`` must be the built-in "studio", which is built when absent.
+
+    Raises:
+        DataError: if there is no folder, it has no known layout, or the subject cannot be read.
+    """
+    if directory is None:
+        if name != STUDIO:
+            raise DataError(expected(f"subject {name!r}", f"a folder, or the built-in {STUDIO!r}", "no folder"))
+        from rsavatar.data.studio import studio_subject_dir
+
+        directory = studio_subject_dir()
+    if not directory.is_dir():
+        raise DataError(expected(f"subject {name!r}", f"a folder {directory}", "nothing there"))
+    subject: Subject = load_named(DATASETS, layout_of(directory))(directory)
+    return subject
+
+
+def layout_of(directory: Path) -> str:
+    """The name in ``catalog.DATASETS`` of the layout that ``directory`` has.
+
+    Raises:
+        DataError: saying what was looked for and what is there.
+    """
+    if (directory / "meta.json").is_file() and (directory / "rs").is_dir():
+        return "rolling"
+    pictures = (directory / "images").is_dir() or any(directory.glob("Camera*"))
+    if (directory / "annots.npy").is_file() and pictures:
+        return "zju"
+    there = ", ".join(sorted(path.name for path in directory.iterdir())[:12]) or "an empty folder"
+    raise DataError(expected(str(directory), _LAYOUTS, there))
