@@ -1,0 +1,108 @@
+// Culling, depth order, and the strips' lists.
+#include <algorithm>
+
+#include "frame.h"
+
+// LSD radix sort of positive floats (their bits sort as integers), 3 passes of 11 bits, carrying `order`. Stable.
+static void sort_by_depth(Slot &slot) {
+    int n = slot.keys.size();
+    slot.keys2.resize(n), slot.order2.resize(n);
+    uint32_t histogram[3][2048] = {};
+    for (uint32_t key : slot.keys) histogram[0][key & 2047]++, histogram[1][key >> 11 & 2047]++, histogram[2][key >> 22]++;
+    for (int pass = 0; pass < 3; pass++) {
+        uint32_t total = 0;
+        for (uint32_t &h : histogram[pass]) total += h, h = total - h;
+        for (int i = 0; i < n; i++) {
+            uint32_t at = histogram[pass][slot.keys[i] >> 11 * pass & 2047]++;
+            slot.keys2[at] = slot.keys[i], slot.order2[at] = slot.order[i];
+        }
+        slot.keys.swap(slot.keys2), slot.order.swap(slot.order2);
+    }
+}
+
+struct Projected {
+    const float *base;
+    size_t stride;
+    float operator()(Field f, int i) const { return base[f * stride + i]; }
+};
+
+static int16_t first_centre(float edge, int lo, int hi) { return (int16_t)std::ceil(std::clamp(edge - 0.5f, (float)lo, (float)hi)); }
+
+// Keeps the Gaussians that can reach a pixel of the slot. Comparisons are written so that NaN is dropped.
+static void cull(const RsFrame &frame, Slot &slot, int count, const Projected &p) {
+    const RsRows &rows = slot.rows;
+    float cut = std::log2(frame.options.alpha_min);
+    slot.ids.clear(), slot.tau.clear(), slot.keys.clear(), slot.order.clear();
+    for (int i = 0; i < count; i++) {
+        float u = p(U, i), v = p(V, i), hx = p(HALF_X, i), hy = p(HALF_Y, i), depth = p(DEPTH, i);
+        bool visible = (depth > 0.f) & (p(LOG2_OPACITY, i) > cut) & (v + hy > rows.lo) & (v - hy < rows.hi) & (u + hx > 0.f) &
+                       (u - hx < frame.camera.width);
+        if (!visible) continue;
+        uint32_t key;
+        memcpy(&key, &depth, 4);
+        slot.keys.push_back(key), slot.order.push_back(slot.ids.size());
+        slot.ids.push_back(i), slot.tau.push_back(p(TAU, i));
+    }
+}
+
+static Splat pack(const RsFrame &frame, const Slot &slot, const Projected &p, int survivor) {
+    int i = slot.ids[survivor];
+    Splat s;
+    s.u = p(U, i), s.v = p(V, i), s.qxx = p(QXX, i), s.qxy = p(QXY, i), s.qyy = p(QYY, i), s.log2_opacity = p(LOG2_OPACITY, i);
+    s.r = p(RED, i), s.g = p(GREEN, i), s.b = p(BLUE, i);
+    s.depth = p(DEPTH, i), s.depth_rate = p(DEPTH_RATE, i), s.tau = p(TAU, i), s.survivor = survivor;
+    float hx = p(HALF_X, i), hy = p(HALF_Y, i);
+    s.x_lo = first_centre(s.u - hx, 0, frame.camera.width), s.x_hi = first_centre(s.u + hx, 0, frame.camera.width);
+    s.y_lo = first_centre(s.v - hy, slot.rows.lo, slot.rows.hi), s.y_hi = first_centre(s.v + hy, slot.rows.lo, slot.rows.hi);
+    return s;
+}
+
+// Within the strip, depth is z + dz/dtau (tau of the strip's middle - own tau): nearly the order that is there already,
+// so insertion sort, which is stable.
+static void resort(const RsFrame &frame, Slot &slot, int strip) {
+    int r0 = slot.rows.lo + strip * frame.options.strip_rows, r1 = std::min(r0 + frame.options.strip_rows, slot.rows.hi);
+    float tau = slot.rows.rate * 0.5f * (r0 + r1) + slot.rows.start;
+    int begin = slot.strip_begin[strip], n = slot.strip_begin[strip + 1] - begin;
+    int32_t *entry = slot.entry_splat.data() + begin, *pair = slot.entry_pair.data() + begin;
+    static thread_local std::vector<float> key;
+    key.resize(n);
+    for (int i = 0; i < n; i++) {
+        const Splat &s = slot.splats[entry[i]];
+        float k = s.depth + s.depth_rate * (tau - s.tau);
+        int32_t e = entry[i], q = pair[i];
+        int j = i;
+        for (; j > 0 && key[j - 1] > k; j--) key[j] = key[j - 1], entry[j] = entry[j - 1], pair[j] = pair[j - 1];
+        key[j] = k, entry[j] = e, pair[j] = q;
+    }
+}
+
+void bin(RsFrame &frame, int index, int count) {
+    Slot &slot = frame.slots[index];
+    Projected p{slot.scratch.data(), slot.scratch.size() / FIELDS};
+    cull(frame, slot, count, p);
+    sort_by_depth(slot);
+    int n = slot.ids.size(), lo = slot.rows.lo, height = frame.options.strip_rows;
+    slot.splats.resize(n), slot.rank.resize(n), slot.first_pair.resize(n + 1);
+    slot.strip_begin.assign(slot.strips + 1, 0);
+    int pairs = 0;
+    for (int k = 0; k < n; k++) {
+        const Splat s = slot.splats[k] = pack(frame, slot, p, slot.order[k]);
+        slot.rank[slot.order[k]] = k, slot.first_pair[k] = pairs;
+        if (s.y_lo >= s.y_hi || s.x_lo >= s.x_hi) continue;
+        for (int strip = (s.y_lo - lo) / height; strip <= (s.y_hi - 1 - lo) / height; strip++) slot.strip_begin[strip + 1]++, pairs++;
+    }
+    slot.first_pair[n] = pairs;
+    for (int strip = 0; strip < slot.strips; strip++) slot.strip_begin[strip + 1] += slot.strip_begin[strip];
+    slot.entry_splat.resize(pairs), slot.entry_pair.resize(pairs);
+    static thread_local std::vector<int32_t> fill;
+    fill.assign(slot.strip_begin.begin(), slot.strip_begin.end() - 1);
+    for (int k = 0; k < n; k++) {
+        int strip = (slot.splats[k].y_lo - lo) / height;
+        for (int pair = slot.first_pair[k]; pair < slot.first_pair[k + 1]; pair++, strip++) {
+            int at = fill[strip]++;
+            slot.entry_splat[at] = k, slot.entry_pair[at] = pair;
+        }
+    }
+    if (slot.rows.rate != 0.f)
+        for (int strip = 0; strip < slot.strips; strip++) resort(frame, slot, strip);
+}

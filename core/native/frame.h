@@ -1,0 +1,65 @@
+// One image's plan, as the stages hand it on: project -> bin -> raster, and back.
+#pragma once
+#include <vector>
+
+#include "layout.h"
+#include "simd.h"
+
+// A projected Gaussian, packed for the rasteriser: one cache line.
+struct alignas(64) Splat {
+    float u, v;                        // mean, pixels
+    float qxx, qxy, qyy;               // log2 alpha = qxx dx^2 + qxy dx dy + qyy dy^2 + log2_opacity
+    float log2_opacity;
+    float r, g, b;
+    int16_t x_lo, x_hi, y_lo, y_hi;    // where alpha >= alpha_min can hold, clipped to the slot and the image
+    float depth, depth_rate, tau;      // depth at its own tau, and its derivative in tau
+    int32_t survivor;                  // index into Slot::ids
+};
+static_assert(sizeof(Splat) == 64, "one cache line");
+
+// Gradient of one splat; the sums over pixels that everything else follows from. g = dL/dalpha * alpha at a pixel.
+enum Moment { M0, MX, MY, MXX, MXY, MYY, MR, MG, MB, MOMENTS };
+
+// Projected Gaussians of one slot before culling, structure of arrays [FIELDS][stride].
+enum Field { U, V, QXX, QXY, QYY, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH, DEPTH_RATE, TAU, HALF_X, HALF_Y, FIELDS };
+
+struct Slot {
+    RsRows rows;
+    int strips;
+    std::vector<int32_t> ids;          // surviving Gaussians, ascending
+    std::vector<float> tau;            // of the survivors
+    std::vector<int32_t> rank;         // survivor -> its splat
+    std::vector<Splat> splats;         // by depth
+    std::vector<int32_t> first_pair;   // splat -> its first pair; a splat's pairs are its strips, from the top; [n + 1]
+    std::vector<int32_t> strip_begin;  // strip -> its first entry; [strips + 1]
+    std::vector<int32_t> entry_splat, entry_pair;  // the strips' lists, by depth
+    std::vector<float> moments;        // [pairs][16], written by the backward raster
+    std::vector<float> scratch;        // [FIELDS][stride]
+    std::vector<uint32_t> keys, keys2;
+    std::vector<int32_t> order, order2;
+};
+
+struct Group {  // slots that share their rows
+    int first_slot, slots;
+};
+
+struct RsFrame {
+    RsCamera camera;
+    RsOptions options;
+    int coefficients;
+    int slot_count = 0;
+    std::vector<Slot> slots;           // capacity is kept between images: slots[0, slot_count) are in use
+    std::vector<Group> groups;
+    std::vector<std::pair<int, int>> tasks;  // (group, strip)
+    std::vector<float> pose_sums;      // [chunks][T][D * 24 * 12]
+};
+
+void project(RsFrame &frame, const RsGaussians &gaussians, const float *pose, int slot, int begin, int end);
+void bin(RsFrame &frame, int slot, int count);
+void raster(RsFrame &frame, float *rgb, float *transmittance);
+void raster_backward(RsFrame &frame, const float *rgb, const float *transmittance, const float *grad_rgb,
+                     const float *grad_transmittance);
+void project_backward(RsFrame &frame, const RsGaussians &gaussians, const float *pose, const RsGradients &gradients);
+
+// Stride of the scratch arrays: whole vectors, plus one so that a block may start anywhere.
+static inline size_t padded(int count) { return ((size_t)count + 2 * LANES - 1) / LANES * LANES; }

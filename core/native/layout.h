@@ -1,0 +1,85 @@
+// The C interface of the kernels, and the layout of everything that crosses it.
+//
+// Axis letters: M Gaussians, B spherical-harmonics bases, J = 24 joints, T slots, D pose coefficients, H rows, W columns.
+// All arrays are float32, contiguous, channel-first (structure of arrays), owned by the caller.
+//
+//   means          [3, M]           metres, canonical space
+//   rotations      [4, M]           quaternions (w, x, y, z) of any length > 0
+//   log_scales     [3, M]           natural logarithm of metres
+//   opacity_logits [M]
+//   sh             [B, 3, M]        B = 1 or 4
+//   skin_weights   [24, M]
+//   screen         [2, M]           pixels added to the projected means; its gradient drives density control
+//   pose           [T, D, 24, 3, 4] joint transforms, canonical to world, as polynomials in tau: sum_d pose[t, d] tau^d
+//   rgb            [3, H, W]        on black
+//   transmittance  [H, W]           1 where nothing was hit
+//
+// A slot (RsRows) covers rows [lo, hi). rate == 0: every Gaussian is posed at tau = start. rate != 0: each Gaussian is
+// posed at its own tau, the fixed point of tau = rate * v(tau) + start, v its projected row in pixels (centres at half
+// integers), clamped to [-1, 1]. Row ranges of two slots are equal (then their images are averaged by weight) or disjoint.
+#pragma once
+#include <cstdint>
+
+constexpr int JOINTS = 24;
+constexpr int MAX_COEFFICIENTS = 12;  // D
+constexpr int MAX_SIZE = 32767;       // H and W: boxes are 16-bit
+
+#define RS_API __attribute__((visibility("default")))
+
+extern "C" {
+
+struct RsGaussians {
+    int32_t count, bases;
+    const float *means, *rotations, *log_scales, *opacity_logits, *sh, *skin_weights, *screen;
+};
+
+// Same shapes as RsGaussians; overwritten. A null pointer: not wanted, not computed.
+struct RsGradients {
+    float *means, *rotations, *log_scales, *opacity_logits, *sh, *skin_weights, *screen, *pose;
+};
+
+struct RsRows {
+    int32_t lo, hi;
+    float rate, start, weight;
+};
+
+struct RsCamera {
+    float rotation[9], translation[3];  // x_cam = rotation x_world + translation
+    float fx, fy, cx, cy;
+    int32_t height, width;
+};
+
+struct RsOptions {
+    float near, dilation, alpha_min, alpha_max, transmittance_min;
+    int32_t strip_rows, threads;
+};
+
+// What the plan of a frame came to; see RsFrame.
+struct RsCounters {
+    int64_t splats;  // Gaussians that survived culling, summed over slots
+    int64_t pairs;   // (splat, strip) pairs rasterised
+};
+
+struct RsFrame;  // one image's plan and scratch, kept between forward and backward and reused between images
+
+RS_API RsFrame *rs_frame_create(void);
+RS_API void rs_frame_destroy(RsFrame *frame);
+
+// 0 on success, 1 out of memory, 2 arguments outside the limits above.
+RS_API int rs_render(RsFrame *frame, const RsGaussians *gaussians, const float *pose, int slots, int coefficients, const RsRows *rows,
+              const RsCamera *camera, const RsOptions *options, float *rgb, float *transmittance, RsCounters *counters);
+
+// Gradients of the image that `frame` rendered last, with the same arguments. rgb and transmittance are that image.
+RS_API int rs_render_backward(RsFrame *frame, const RsGaussians *gaussians, const float *pose, const float *rgb,
+                       const float *transmittance, const float *grad_rgb, const float *grad_transmittance,
+                       const RsGradients *gradients);
+
+// Mean absolute error of an image over a grey background and of its opacity against a mask, with its gradient.
+//   loss = mean_{3HW} |rgb + background * transmittance - target/255| + mask_weight * mean_{HW} |1 - transmittance - mask/255|
+// target [H, W, 3] and mask [H, W] are bytes; target is composited over the background by the mask (target holds
+// premultiplied colour on black). grad_rgb and grad_transmittance are overwritten.
+RS_API double rs_l1(const float *rgb, const float *transmittance, const uint8_t *target, const uint8_t *mask, int height, int width,
+             float background, float mask_weight, int threads, float *grad_rgb, float *grad_transmittance);
+
+RS_API int rs_lanes(void);  // SIMD lanes of this build, for reports
+}
