@@ -215,7 +215,7 @@ def _conic(gaussians: Gaussians, posed: Posed, camera: Camera, options: Options)
     k1, k2 = K.unbind(1)
     eps = options.dilation
     squares = (k1 * k1).sum(-1), (k2 * k2).sum(-1)
-    determinant = torch.linalg.cross(k1, k2).square().sum(-1) + eps * (squares[0] + squares[1]) + eps * eps
+    determinant = torch.cross(k1, k2, dim=-1).square().sum(-1) + eps * (squares[0] + squares[1]) + eps * eps
     return torch.stack([squares[1] + eps, -(k1 * k2).sum(-1), squares[0] + eps]) / determinant
 
 

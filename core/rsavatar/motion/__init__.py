@@ -1,0 +1,1 @@
+"""Pose as a function of time: one trajectory per frame, learnable."""

@@ -1,0 +1,113 @@
+"""The paper's sub-frame motion: P control vectors per frame and joint, combined by a uniform B-spline of order P.
+
+**Convention**: u = 1/2 + offset / period, so that u in [0, 1] is the frame's own window; a camera whose trigger lies
+off centre reads the same polynomial beyond it. Control vectors are not shared between frames: ``penalty`` ties them.
+"""
+
+from __future__ import annotations
+
+from math import comb, factorial
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from rsavatar.geometry.rotations import exp_so3, geodesic_distance
+from rsavatar.motion.base import JOINTS, AbstractMotion, BodyState, Continuity, InitialMotion, split
+
+Perturbation = Literal["zero-mean", "positive"]
+ZERO_MEAN_DEVIATION = 1e-3  # radians and metres: breaks ties between control points, moves no joint visibly
+POSITIVE_RANGE = (0.001, 0.05)  # radians and metres, MAD-Avatar's public code; biases the pose by about half of it
+_TINY = 1e-20  # keeps the gradient of a length finite at 0
+
+
+def basis_matrix(P: int) -> Tensor:
+    """B-spline basis matrix M [P, P], float64 (paper, eq. Mmatrix, with 0^0 = 1): value(u) = [1, u, ...] M c.
+
+    Rows are powers of u, columns are control points; order P is degree P - 1. P = 4 is the uniform cubic B-spline.
+    """
+    rows = []
+    for i in range(P):
+        front = comb(P - 1, P - 1 - i) / factorial(P - 1)
+        signed = [
+            [(-1) ** (s - j) * comb(P, s - j) * (P - s - 1) ** (P - 1 - i) for s in range(j, P)] for j in range(P)
+        ]
+        rows.append([front * sum(terms) for terms in signed])
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+class FrameSpline(AbstractMotion):
+    """A polynomial of degree P - 1 in axis-angle components and translation per frame (paper, eq. spline).
+
+    ``control`` [N, P, 25, 3] float32 holds Rh in channel 0, joints 1..23, and Th in channel 24. It starts at the fit,
+    perturbed, so the initial trajectory of a frame is nearly constant: "zero-mean" noise is normal, on all control
+    points; "positive" is uniform on all but the first, as in MAD-Avatar's public code. ``bands`` is the paper's T,
+    which only "paper" continuity speaks of. ``P`` is at least 2.
+    """
+
+    basis: Tensor  # [P, P] float64
+
+    def __init__(
+        self, initial: InitialMotion, bands: int, P: int = 4, perturbation: Perturbation = "zero-mean", seed: int = 0
+    ) -> None:
+        super().__init__()
+        fit = initial.stacked()[:, None].expand(-1, P, -1, -1)
+        self.control = torch.nn.Parameter((fit + _noise(fit.shape, perturbation, seed)).float())
+        self.period = initial.period_frames
+        self.readout = initial.readout_frames
+        self.bands = bands
+        self.register_buffer("basis", basis_matrix(P), persistent=False)
+        self.register_buffer("mid_frames", torch.as_tensor(initial.mid_frames, dtype=torch.float64), persistent=False)
+
+    def state(self, frame: int, offsets: Tensor) -> BodyState:
+        """States [D] of frame ``frame`` at ``offsets`` [D] source frames from its mid time: one product for all."""
+        weights = self._weights(0.5 + offsets / self.period)
+        return split(torch.einsum("dp,pjc->djc", weights, self.control[frame]))
+
+    def at(self, times: Tensor) -> BodyState:
+        """States at absolute ``times`` [...], source frames, by the trajectory of the nearest frame."""
+        frame = self.nearest(times)
+        weights = self._weights(0.5 + (times - self.mid_frames[frame]) / self.period)
+        return split(torch.einsum("...p,...pjc->...jc", weights, self.control[frame]))
+
+    def penalty(self, kind: Continuity) -> Tensor:
+        """Mean gap between the end of each frame's trajectory and the start of the next frame's, radians.
+
+        ``"paper"`` (eq. reg) compares the last band's instant of frame n with the first band's of n + 1, which are
+        1 / T of a readout apart: it also holds back true motion, by up to that step. ``"aligned"`` compares both
+        trajectories at the one instant where their windows meet (u = 1 and u = 0), and adds the distance of the two
+        translations there, metres, with weight 1. Rh counts as joint 0. Only frames whose windows meet are compared.
+        """
+        reach = 0.5 if kind == "aligned" else 0.5 * (self.bands - 1) / self.bands * self.readout / self.period
+        ends = self._weights(torch.tensor([0.5 + reach, 0.5 - reach], dtype=torch.float64, device=self.control.device))
+        meeting = self._meeting()
+        if not len(meeting):
+            return self.control.new_zeros(())
+        last = torch.einsum("p,npjc->njc", ends[0], self.control[meeting])
+        first = torch.einsum("p,npjc->njc", ends[1], self.control[meeting + 1])
+        R = exp_so3(torch.stack([last, first])[:, :, :JOINTS])
+        gap = geodesic_distance(R[0], R[1]).mean()
+        if kind == "aligned":
+            gap = gap + ((last[:, JOINTS] - first[:, JOINTS]).square().sum(-1) + _TINY).sqrt().mean()
+        return gap
+
+    def _weights(self, u: Tensor) -> Tensor:
+        """Weights [..., P] of the control points at ``u`` [...], which may leave [0, 1]."""
+        powers = u[..., None] ** torch.arange(len(self.basis), device=u.device)
+        return (powers.to(self.basis) @ self.basis).to(self.control.dtype)
+
+    def _meeting(self) -> Tensor:
+        """Indices n of the frames whose window ends where that of n + 1 starts."""
+        gaps = self.mid_frames[1:] - self.mid_frames[:-1]
+        return torch.nonzero((gaps - self.period).abs() < 1e-6 * self.period)[:, 0]
+
+
+def _noise(shape: torch.Size, perturbation: Perturbation, seed: int) -> Tensor:
+    """The perturbation of the control points [N, P, 25, 3]."""
+    generator = torch.Generator().manual_seed(seed)
+    if perturbation == "zero-mean":
+        return ZERO_MEAN_DEVIATION * torch.randn(shape, generator=generator, dtype=torch.float64)
+    low, high = POSITIVE_RANGE
+    noise = low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
+    noise[:, 0] = 0.0
+    return noise
