@@ -54,10 +54,15 @@ class TimedRows:
 
 @dataclass(frozen=True)
 class Rendering:
-    """An image on black: ``rgb`` [3, H, W] and ``transmittance`` [H, W] (1 where nothing was hit)."""
+    """An image on black: ``rgb`` [3, H, W] and ``transmittance`` [H, W] (1 where nothing was hit).
+
+    ``splats`` Gaussians survived culling (summed over slots) and made ``pairs`` (splat, strip) pairs; 0 = not counted.
+    """
 
     rgb: Tensor
     transmittance: Tensor
+    splats: int = 0
+    pairs: int = 0
 
     def over(self, background: float) -> Tensor:
         """Composited over a grey background, [3, H, W]."""

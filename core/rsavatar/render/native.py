@@ -1,0 +1,235 @@
+"""The renderer on the native kernels: ``render(scene)``, differentiable, bit-identical for any number of threads.
+
+Layouts are those of ``core/native/layout.h``; tensors cross without a copy. The kernels use as many threads as torch.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rsavatar.errors import KernelError, expected
+from rsavatar.geometry.cameras import Camera
+from rsavatar.render.base import Gaussians, Options, Rendering, Scene, TimedRows
+
+_FIELDS = ("means", "rotations", "log_scales", "opacity_logits", "sh", "skin_weights", "screen")
+_Pointer = ctypes.c_void_p
+
+
+class _Gaussians(ctypes.Structure):
+    _fields_ = (("count", ctypes.c_int32), ("bases", ctypes.c_int32), *((name, _Pointer) for name in _FIELDS))
+
+
+class _Gradients(ctypes.Structure):
+    _fields_ = tuple((name, _Pointer) for name in (*_FIELDS, "pose"))
+
+
+class _Rows(ctypes.Structure):
+    _fields_ = (
+        ("lo", ctypes.c_int32),
+        ("hi", ctypes.c_int32),
+        ("rate", ctypes.c_float),
+        ("start", ctypes.c_float),
+        ("weight", ctypes.c_float),
+    )
+
+
+class _Camera(ctypes.Structure):
+    _fields_ = (
+        ("rotation", ctypes.c_float * 9),
+        ("translation", ctypes.c_float * 3),
+        *((name, ctypes.c_float) for name in ("fx", "fy", "cx", "cy")),
+        ("height", ctypes.c_int32),
+        ("width", ctypes.c_int32),
+    )
+
+
+class _Options(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_float) for name in ("near", "dilation", "alpha_min", "alpha_max", "transmittance_min")),
+        ("strip_rows", ctypes.c_int32),
+        ("threads", ctypes.c_int32),
+    )
+
+
+class _Counters(ctypes.Structure):
+    _fields_ = (("splats", ctypes.c_int64), ("pairs", ctypes.c_int64))
+
+
+_REASONS = {1: "out of memory", 2: "an argument is outside the limits of core/native/layout.h"}
+
+
+def targets() -> list[str]:
+    """Instruction sets that this machine has, best first."""
+    capability = torch.backends.cpu.get_cpu_capability()
+    return {"AVX512": ["avx512", "avx2"], "AVX2": ["avx2"]}.get(capability, ["generic"])
+
+
+@cache
+def library() -> Any:
+    """The kernels built for this machine.
+
+    Raises:
+        KernelError: if none was built, or none that this processor can run.
+    """
+    folder = Path(__file__).parent
+    found = [folder / f"_kernels_{t}.so" for t in targets() if (folder / f"_kernels_{t}.so").exists()]
+    if not found:
+        there = ", ".join(sorted(p.name for p in folder.glob("_kernels_*.so"))) or "no kernel library"
+        wanted = f"a library for {' or '.join(targets())} in {folder.name}/ (pip install . builds it)"
+        raise KernelError(expected("native kernels", wanted, there))
+    lib = ctypes.CDLL(str(found[0]))
+    pointer, integer = ctypes.c_void_p, ctypes.c_int
+    lib.rs_frame_create.restype = pointer
+    lib.rs_frame_destroy.argtypes = [pointer]
+    lib.rs_render.argtypes = [pointer, pointer, pointer, integer, integer, *[pointer] * 6]
+    lib.rs_render_backward.argtypes = [pointer] * 8
+    lib.rs_l1.restype = ctypes.c_double
+    float_ = ctypes.c_float
+    lib.rs_l1.argtypes = [pointer] * 4 + [integer, integer, float_, float_, integer, pointer, pointer]
+    return lib
+
+
+def available() -> bool:
+    """Whether the kernels can be used on this machine."""
+    try:
+        library()
+    except KernelError:
+        return False
+    return True
+
+
+class _Frame:
+    """A kernel-side frame; goes back to the pool when the last reference to it does."""
+
+    pool: list[int] = []  # noqa: RUF012 - one pool a process, on purpose
+
+    def __init__(self) -> None:
+        self.handle = self.pool.pop() if self.pool else library().rs_frame_create()
+        if not self.handle:
+            raise KernelError(expected("frame", "memory for a frame's plan", _REASONS[1]))
+
+    def __del__(self) -> None:
+        if getattr(self, "handle", None):
+            self.pool.append(self.handle)
+
+
+def _c_camera(camera: Camera) -> _Camera:
+    rotation = (ctypes.c_float * 9)(*camera.rotation.ravel())
+    translation = (ctypes.c_float * 3)(*camera.translation)
+    return _Camera(rotation, translation, camera.fx, camera.fy, camera.cx, camera.cy, camera.height, camera.width)
+
+
+def _c_options(o: Options) -> _Options:
+    threads = torch.get_num_threads()
+    return _Options(o.near, o.dilation, o.alpha_min, o.alpha_max, o.transmittance_min, o.strip_rows, threads)
+
+
+def _c_gaussians(tensors: tuple[Tensor, ...]) -> _Gaussians:
+    return _Gaussians(tensors[0].shape[1], tensors[4].shape[0], *(t.data_ptr() for t in tensors[:7]))
+
+
+def _check(code: int) -> None:
+    if code:
+        raise KernelError(expected("native render", "success", _REASONS.get(code, f"code {code}")))
+
+
+class _Render(torch.autograd.Function):
+    """rgb, transmittance = f(the seven tensors of ``Gaussians``, pose); see ``rs_render`` in layout.h."""
+
+    @staticmethod
+    def forward(ctx: Any, static: tuple[Any, ...], *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        rows, camera, options = static
+        frame = _Frame()
+        tensors = tuple(t.detach().contiguous() for t in tensors)
+        pose = tensors[7]
+        rgb = torch.empty(3, camera.height, camera.width)
+        transmittance = torch.empty(camera.height, camera.width)
+        counters = _Counters()
+        code = library().rs_render(
+            frame.handle,
+            ctypes.byref(_c_gaussians(tensors)),
+            pose.data_ptr(),
+            pose.shape[0],
+            pose.shape[1],
+            ctypes.byref((_Rows * len(rows))(*(_Rows(r.lo, r.hi, r.rate, r.start, r.weight) for r in rows))),
+            ctypes.byref(_c_camera(camera)),
+            ctypes.byref(_c_options(options)),
+            rgb.data_ptr(),
+            transmittance.data_ptr(),
+            ctypes.byref(counters),
+        )
+        _check(code)
+        ctx.frame = frame if any(ctx.needs_input_grad) else None
+        ctx.save_for_backward(*tensors, rgb, transmittance)
+        counted = torch.tensor([counters.splats, counters.pairs])
+        ctx.mark_non_differentiable(counted)
+        return rgb, transmittance, counted
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        *tensors, rgb, transmittance = ctx.saved_tensors
+        if ctx.frame is None:
+            raise KernelError(expected("native render", "one backward for one forward", "a second backward"))
+        needs = ctx.needs_input_grad[1:]
+        wanted = [torch.empty_like(t) if need else None for t, need in zip(tensors, needs, strict=True)]
+        grad_rgb, grad_transmittance = upstream[0].contiguous(), upstream[1].contiguous()
+        gradients = _Gradients(*(None if t is None else t.data_ptr() for t in wanted))
+        code = library().rs_render_backward(
+            ctx.frame.handle,
+            ctypes.byref(_c_gaussians(tuple(tensors))),
+            tensors[7].data_ptr(),
+            rgb.data_ptr(),
+            transmittance.data_ptr(),
+            grad_rgb.data_ptr(),
+            grad_transmittance.data_ptr(),
+            ctypes.byref(gradients),
+        )
+        ctx.frame = None  # back to the pool
+        _check(code)
+        return (None, *wanted)
+
+
+def render(scene: Scene) -> Rendering:
+    """Render a scene; float32.
+
+    Differentiable in every tensor of ``scene.gaussians`` and in ``scene.pose``, once.
+
+    Raises:
+        KernelError: if a tensor is not float32 on the CPU or of a wrong shape, if slots' rows partly overlap or leave
+            the image, or if no kernel library fits this machine.
+    """
+    g = scene.gaussians
+    tensors = (*(getattr(g, name) for name in _FIELDS), scene.pose)
+    _validate(g, scene.pose, scene.rows)
+    rgb, transmittance, counted = _apply((scene.rows, scene.camera, scene.options), *tensors)
+    splats, pairs = counted.tolist()
+    return Rendering(rgb, transmittance, splats, pairs)
+
+
+_apply: Callable[..., tuple[Tensor, Tensor, Tensor]] = _Render.apply  # torch leaves apply untyped
+
+
+def _validate(g: Gaussians, pose: Tensor, rows: tuple[TimedRows, ...]) -> None:
+    m, bases, slots = g.count, g.sh.shape[0], len(rows)
+    shapes: dict[str, tuple[int, ...]] = {
+        "means": (3, m),
+        "rotations": (4, m),
+        "log_scales": (3, m),
+        "opacity_logits": (m,),
+        "sh": (bases, 3, m),
+        "skin_weights": (24, m),
+        "screen": (2, m),
+    }
+    pairs = [(name, getattr(g, name), shape) for name, shape in shapes.items()]
+    pairs.append(("pose", pose, (slots, pose.shape[1], 24, 3, 4)))
+    for name, tensor, shape in pairs:
+        if tensor.dtype != torch.float32 or tensor.device.type != "cpu" or tuple(tensor.shape) != shape:
+            got = f"{tensor.dtype} {tuple(tensor.shape)} on {tensor.device}"
+            raise KernelError(expected(name, f"torch.float32 {shape} on cpu", got))

@@ -1,0 +1,120 @@
+"""The native kernels against the float64 twin: every shutter, every input."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from rsavatar.errors import KernelError
+from rsavatar.render import native, reference
+from rsavatar.render.base import Gaussians, Rendering, Scene, TimedRows
+from tests.core import scenes
+
+pytestmark = pytest.mark.skipif(not native.available(), reason="no native kernels were built for this machine")
+
+
+def leaves(s: Scene) -> tuple[Scene, dict[str, Tensor]]:
+    tensors = {f.name: getattr(s.gaussians, f.name).clone().requires_grad_() for f in fields(Gaussians)}
+    pose = s.pose.clone().requires_grad_()
+    return replace(s, gaussians=Gaussians(**tensors), pose=pose), {**tensors, "pose": pose}
+
+
+def gradients(render: object, s: Scene, seed: int = 5) -> tuple[Rendering, dict[str, Tensor]]:
+    s, tensors = leaves(s)
+    image: Rendering = render(s)  # type: ignore[operator]
+    g = torch.Generator().manual_seed(seed)
+    rgb = torch.randn(image.rgb.shape, generator=g, dtype=torch.float64).to(image.rgb.dtype)
+    t = torch.randn(image.transmittance.shape, generator=g, dtype=torch.float64).to(image.rgb.dtype)
+    ((image.rgb * rgb).sum() + (image.transmittance * t).sum()).backward()
+    return image, {name: x.grad.double() for name, x in tensors.items() if x.grad is not None}
+
+
+@pytest.mark.parametrize("bases", [1, 4])
+@pytest.mark.parametrize("kind", scenes.KINDS)
+def test_image_and_gradients_of_every_input_equal_the_twin(kind: str, bases: int) -> None:
+    truth, expected = gradients(reference.render, scenes.scene(kind, bases=bases))
+    image, got = gradients(native.render, scenes.scene(kind, bases=bases, dtype=torch.float32))
+    # A pixel whose alpha lies within float32 rounding of the 1/255 cutoff may fall on either side: at most one such
+    # contribution, 1/255 of a colour, is let pass.
+    assert (image.rgb.double() - truth.rgb).abs().max() < 1 / 255
+    assert (image.rgb.double() - truth.rgb).square().mean().sqrt() < 2e-5
+    assert set(got) == set(expected)
+    for name, want in expected.items():
+        error = (got[name] - want).norm() / want.norm()
+        assert error < 1e-4, f"gradient of {name}: relative error {error:.1e}"
+
+
+@pytest.mark.parametrize("kind", scenes.KINDS)
+def test_any_number_of_threads_gives_the_same_bits(kind: str) -> None:
+    s = scenes.scene(kind, count=400, dtype=torch.float32)
+    before = torch.get_num_threads()
+    runs = []
+    try:
+        for threads in (1, 2, 3, 2):
+            torch.set_num_threads(threads)
+            runs.append(gradients(native.render, s))
+    finally:
+        torch.set_num_threads(before)
+    for image, grads in runs[1:]:
+        assert torch.equal(image.rgb, runs[0][0].rgb)
+        assert all(torch.equal(grads[name], runs[0][1][name]) for name in grads)
+
+
+def test_gradients_that_nobody_wants_are_not_computed() -> None:
+    s = scenes.scene("scanline", dtype=torch.float32)
+    pose = s.pose.clone().requires_grad_()
+    native.render(replace(s, pose=pose)).rgb.sum().backward()
+    _, full = gradients(lambda x: native.render(x), s)
+    assert pose.grad is not None
+    assert set(full) == {"means", "rotations", "log_scales", "opacity_logits", "sh", "skin_weights", "screen", "pose"}
+
+
+def test_nothing_to_see_is_black_and_transparent() -> None:
+    s = scenes.scene("scanline", dtype=torch.float32)
+    behind = s.pose.clone()
+    behind[:, 0, :, 2, 3] -= 50.0
+    image = native.render(replace(s, pose=behind))
+    assert image.splats == 0
+    assert torch.equal(image.rgb, torch.zeros_like(image.rgb))
+    assert torch.equal(image.transmittance, torch.ones_like(image.transmittance))
+
+
+def test_rows_without_a_slot_are_empty() -> None:
+    s = scenes.scene("part", dtype=torch.float32)
+    image = native.render(s)
+    assert torch.equal(image.transmittance[:7], torch.ones(7, scenes.WIDTH))
+    assert image.transmittance[7:41].min() < 1
+    assert torch.equal(image.rgb[:, 41:], torch.zeros(3, scenes.HEIGHT - 41, scenes.WIDTH))
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        (TimedRows(0, 61, 0.0, 0.0),),
+        (TimedRows(0, 30, 0.0, 0.0), TimedRows(20, 40, 0.0, 0.0)),
+        (TimedRows(30, 30, 0.0, 0.0),),
+    ],
+)
+def test_rows_outside_the_image_or_partly_overlapping_are_refused(rows: tuple[TimedRows, ...]) -> None:
+    s = scenes.scene("global", dtype=torch.float32)
+    with pytest.raises(KernelError, match="limits"):
+        native.render(replace(s, rows=rows, pose=s.pose.expand(len(rows), -1, -1, -1, -1)))
+
+
+def test_a_wrong_type_or_shape_is_named() -> None:
+    s = scenes.scene("global", dtype=torch.float32)
+    with pytest.raises(KernelError, match=r"means: expected torch.float32 \(3, 150\) on cpu, got torch.float64"):
+        native.render(replace(s, gaussians=replace(s.gaussians, means=s.gaussians.means.double())))
+    with pytest.raises(KernelError, match="pose: expected"):
+        native.render(replace(s, pose=s.pose[:, :, :23]))
+
+
+def test_a_second_backward_is_refused() -> None:
+    s, _ = leaves(scenes.scene("global", dtype=torch.float32))
+    loss = native.render(s).rgb.sum()
+    loss.backward(retain_graph=True)
+    with pytest.raises(KernelError, match="second backward"):
+        loss.backward()
