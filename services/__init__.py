@@ -1,0 +1,1 @@
+"""The service around the core: API, worker, store. Runs from the checkout."""

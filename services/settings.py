@@ -1,0 +1,151 @@
+"""The one place where the service reads its environment: ``RSAVATAR_*`` variables become a frozen ``Settings``."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, ValidationError, field_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+
+from services.errors import SettingsError
+
+LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
+LONGEST_SOCKET_PATH = 100  # sun_path holds 108 bytes on Linux, 104 on macOS
+ROOT = Path(__file__).resolve().parent.parent  # children are started here, where `services` can be imported
+
+
+class Settings(BaseSettings):
+    """Every knob of the service. A field ``x`` is read from the variable ``RSAVATAR_X``."""
+
+    model_config = SettingsConfigDict(env_prefix="RSAVATAR_", frozen=True, extra="ignore")
+
+    home: Path = Field(default=Path("~/.local/share/rsavatar"), description="everything that is kept")
+    database_url: str = Field(default="", description="SQLAlchemy URL; empty = SQLite in the home")
+    broker_url: str = Field(default="", description="redis URL; empty = a private server on a unix socket in the home")
+    redis_server: Path | None = Field(default=None, description="binary of the private server; none = look for one")
+    subject_roots: Annotated[tuple[Path, ...], NoDecode] = Field(
+        default=(), description="folders that may hold subjects"
+    )
+
+    host: str = Field(default="127.0.0.1", description="address that the API binds")
+    port: int = Field(default=8000, ge=0, le=65535, description="port that the API binds")
+    allow_remote: bool = Field(default=False, description="bind an address other than loopback, without any login")
+    allowed_hosts: Annotated[tuple[str, ...], NoDecode] = Field(
+        default=(), description="more names that a Host header may say"
+    )
+    max_body_bytes: int = Field(default=65_536, ge=1024, description="largest request body")
+    ping_seconds: float = Field(default=15.0, gt=0, description="silence on an event stream before a comment is sent")
+    poll_seconds: float = Field(default=0.4, gt=0, description="seconds between two looks of a stream at the store")
+
+    worker_concurrency: int = Field(default=1, ge=1, le=64, description="jobs that one worker trains at a time")
+    threads_per_job: int = Field(default=0, ge=0, description="threads of one job; 0 = cores / worker_concurrency")
+    memory_limit_mb: int = Field(default=0, ge=0, description="data segment of a job's process; 0 = unlimited")
+    max_attempts: int = Field(default=3, ge=1, description="infrastructure failures that a job survives, plus one")
+    lease_seconds: float = Field(default=75.0, gt=0, description="silence after which a worker's job is given away")
+    heartbeat_seconds: float = Field(default=1.0, gt=0, description="seconds between two writes of a running job")
+    stall_seconds: float = Field(default=900.0, gt=0, description="time without progress after which a job is killed")
+    grace_seconds: float = Field(default=30.0, ge=0, description="seconds between asking a job to stop and killing it")
+    backoff_seconds: float = Field(default=2.0, ge=0, description="wait before the first retry; doubles each time")
+    sweep_seconds: float = Field(default=5.0, gt=0, description="seconds between two rounds of the sweeper")
+    unclaimed_seconds: float = Field(
+        default=10.0, ge=0, description="age at which a waiting job's wake-up counts as lost"
+    )
+    child_command: tuple[str, ...] = Field(
+        default=(sys.executable, "-m", "services.worker.child"),
+        description="the process that trains",
+    )
+
+    @field_validator("home")
+    @classmethod
+    def _absolute(cls, home: Path) -> Path:
+        return home.expanduser().absolute()
+
+    @field_validator("subject_roots", mode="before")
+    @classmethod
+    def _split_paths(cls, value: Any) -> Any:
+        return tuple(p for p in value.split(os.pathsep) if p) if isinstance(value, str) else value
+
+    @field_validator("allowed_hosts", mode="before")
+    @classmethod
+    def _split_names(cls, value: Any) -> Any:
+        return tuple(n.strip() for n in value.split(",") if n.strip()) if isinstance(value, str) else value
+
+    @property
+    def embedded_database(self) -> bool:
+        """Whether the database is the SQLite file in the home, which migrates itself."""
+        return not self.database_url
+
+    @property
+    def embedded_broker(self) -> bool:
+        """Whether the broker is a private server that ``services.up`` starts."""
+        return not self.broker_url
+
+    @property
+    def database(self) -> str:
+        """SQLAlchemy URL of the database."""
+        return self.database_url or f"sqlite:///{self.home / 'rsavatar.db'}"
+
+    @property
+    def socket(self) -> Path:
+        """Unix socket of the private broker; outside of a home whose path is too long for a socket."""
+        inside = self.home / "run" / "redis.sock"
+        if len(os.fsencode(inside)) <= LONGEST_SOCKET_PATH:
+            return inside
+        digest = hashlib.sha256(os.fsencode(self.home)).hexdigest()[:12]
+        return Path(tempfile.gettempdir()) / f"rsavatar-{os.getuid()}-{digest}" / "redis.sock"
+
+    @property
+    def broker(self) -> str:
+        """Kombu URL of the broker."""
+        return self.broker_url or f"redis+socket://{self.socket}?virtual_host=0"
+
+    @property
+    def threads(self) -> int:
+        """Threads of one job."""
+        return self.threads_per_job or max(1, (os.cpu_count() or 1) // self.worker_concurrency)
+
+    @property
+    def url(self) -> str:
+        """Where a browser on this machine finds the API."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"http://{host}:{self.port}"
+
+    def job_dir(self, job_id: str) -> Path:
+        """Folder of one job: checkpoint, outputs and log; the same for every attempt."""
+        return self.home / "jobs" / job_id
+
+    def require_safe_bind(self) -> None:
+        """Refuse an address that other machines reach, unless the operator has said so.
+
+        Raises:
+            SettingsError: if ``host`` is not loopback and ``allow_remote`` is off.
+        """
+        if self.host not in LOOPBACK and not self.allow_remote:
+            wanted = "a loopback address (there is no login), or RSAVATAR_ALLOW_REMOTE=1 behind a proxy that has one"
+            raise SettingsError("RSAVATAR_HOST", wanted, self.host)
+
+
+def read_settings() -> Settings:
+    """Read the environment.
+
+    Raises:
+        SettingsError: naming the variable, what was expected and what was got.
+    """
+    try:
+        return Settings()
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = "RSAVATAR_" + str(first["loc"][0]).upper()
+        raise SettingsError(name, first["msg"].lower(), repr(first["input"])) from None
+
+
+def make_home(settings: Settings) -> None:
+    """Create the home and its folders, readable by their owner alone."""
+    inside = (settings.home / name for name in ("run", "jobs", "artifacts", "logs"))
+    for folder in (settings.home, *inside, settings.socket.parent):
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)

@@ -1,0 +1,199 @@
+"""Jobs as users see them: submitted, listed, cancelled, paused, resumed, retried."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+from sqlalchemy import ColumnElement, func, select, update
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session
+
+from services.errors import ConflictError, NotFoundError, RequestError
+from services.store import events
+from services.store.ids import new_id
+from services.store.records import RETRYABLE, Filters, Job, State, Submission
+from services.store.session import Store, db_now
+from services.store.tables import JobRow
+
+FIELDS = tuple(f.name for f in fields(Job))
+NO_ORDERS = {"cancel_requested_at": None, "pause_requested_at": None}
+
+
+def to_job(row: JobRow) -> Job:
+    """The record of a row."""
+    return Job(**{name: getattr(row, name) for name in FIELDS})
+
+
+def submit(store: Store, submission: Submission) -> tuple[Job, bool]:
+    """Accept a job; the second value says whether it is new. After the return the job cannot be lost.
+
+    Raises:
+        RequestError: if the idempotency key was used for another request.
+    """
+    try:
+        return _submit(store, submission)
+    except IntegrityError:  # another process took the key between our look and our insert; now we see its job
+        return _submit(store, submission)
+
+
+def _submit(store: Store, submission: Submission) -> tuple[Job, bool]:
+    with store.write() as session:
+        if submission.idempotency_key is not None:
+            query = select(JobRow).where(JobRow.idempotency_key == submission.idempotency_key)
+            if (earlier := session.scalar(query)) is not None:
+                if earlier.request_sha256 != submission.request_sha256:
+                    raise RequestError("Idempotency-Key", "the request it was first used for", "another request")
+                return to_job(earlier), False
+        row = JobRow(id=new_id(), created_at=session.scalar(select(db_now())), **_columns(submission))
+        session.add(row)
+        session.flush()
+        events.append(session, row.id, [events.state_event(State.QUEUED)])
+        return to_job(row), True
+
+
+def _columns(submission: Submission) -> dict[str, Any]:
+    spec = dict(submission.spec)
+    return {
+        "spec": spec,
+        "spec_sha256": submission.spec_sha256,
+        "method": spec["method"],
+        "subject": spec["subject"],
+        "priority": spec["priority"],
+        "grid_id": submission.grid_id,
+        "idempotency_key": submission.idempotency_key,
+        "request_sha256": submission.request_sha256,
+        "state": State.QUEUED,
+        "max_attempts": submission.max_attempts,
+    }
+
+
+def get(store: Store, job_id: str) -> Job:
+    """One job.
+
+    Raises:
+        NotFoundError: if there is none with this id.
+    """
+    with store.read() as session:
+        return to_job(_row(session, job_id))
+
+
+def _row(session: Session, job_id: str) -> JobRow:
+    row = session.get(JobRow, job_id)
+    if row is None:
+        raise NotFoundError("job", "the id of a job", job_id)
+    return row
+
+
+def page(store: Store, filters: Filters, before: str | None, limit: int) -> list[Job]:
+    """Up to ``limit`` jobs older than the id ``before``, newest first."""
+    wanted = {
+        JobRow.state: filters.state,
+        JobRow.method: filters.method,
+        JobRow.subject: filters.subject,
+        JobRow.grid_id: filters.grid,
+    }
+    query = select(JobRow).order_by(JobRow.id.desc()).limit(limit)
+    query = query.where(*(column == value for column, value in wanted.items() if value is not None))
+    if before is not None:
+        query = query.where(JobRow.id < before)
+    with store.read() as session:
+        return [to_job(row) for row in session.scalars(query)]
+
+
+def count_by_state(store: Store) -> dict[str, int]:
+    """Number of jobs in every state, zeros included."""
+    with store.read() as session:
+        found = {
+            state: count for state, count in session.execute(select(JobRow.state, func.count()).group_by(JobRow.state))
+        }
+    return {str(state): found.get(state, 0) for state in State}
+
+
+def oldest_wait(store: Store) -> float:
+    """Seconds that the oldest job which could run has waited; 0 when none waits."""
+    due = (JobRow.state == State.QUEUED) & (JobRow.not_before <= db_now())
+    with store.read() as session:
+        return float(session.scalar(select(db_now() - func.min(JobRow.created_at)).where(due)) or 0.0)
+
+
+def cancel(store: Store, job_id: str) -> Job:
+    """Cancel: at once if the job waits or pauses, else ask the worker, which leaves a checkpoint.
+
+    Raises:
+        NotFoundError: if there is no such job.
+        ConflictError: if the job has ended otherwise.
+    """
+    with store.write() as session:
+        row = _row(session, job_id)
+        if row.state in {State.QUEUED, State.PAUSED}:
+            _move(session, row, State.CANCELLED, {"finished_at": db_now()})
+        elif row.state == State.RUNNING and row.cancel_requested_at is None:
+            _change(session, row, {"cancel_requested_at": db_now()})
+        elif row.state not in {State.RUNNING, State.CANCELLED}:
+            raise ConflictError("state", "a job that waits, runs or pauses", row.state)
+        return to_job(row)
+
+
+def pause(store: Store, job_id: str) -> Job:
+    """Pause: at once if the job waits, else ask the worker, which leaves a checkpoint.
+
+    Raises:
+        NotFoundError: if there is no such job.
+        ConflictError: if the job has ended.
+    """
+    with store.write() as session:
+        row = _row(session, job_id)
+        if row.state == State.QUEUED:
+            _move(session, row, State.PAUSED, {})
+        elif row.state == State.RUNNING and row.pause_requested_at is None:
+            _change(session, row, {"pause_requested_at": db_now()})
+        elif row.state not in {State.RUNNING, State.PAUSED}:
+            raise ConflictError("state", "a job that waits or runs", row.state)
+        return to_job(row)
+
+
+def resume(store: Store, job_id: str) -> Job:
+    """Put a paused job back into the queue; it goes on from its checkpoint.
+
+    Raises:
+        NotFoundError: if there is no such job.
+        ConflictError: if the job is not paused.
+    """
+    with store.write() as session:
+        row = _row(session, job_id)
+        if row.state != State.PAUSED:
+            raise ConflictError("state", "a paused job", row.state)
+        _move(session, row, State.QUEUED, {"not_before": 0.0, **NO_ORDERS})
+        return to_job(row)
+
+
+def retry(store: Store, job_id: str) -> Job:
+    """Put a job that failed, died or was cancelled back into the queue with a fresh count of failures.
+
+    Raises:
+        NotFoundError: if there is no such job.
+        ConflictError: if the job has not ended, or has succeeded.
+    """
+    fresh = {"failures": 0, "not_before": 0.0, "error": None, "error_kind": None, "finished_at": None}
+    with store.write() as session:
+        row = _row(session, job_id)
+        if row.state not in RETRYABLE:
+            raise ConflictError("state", f"one of {', '.join(sorted(RETRYABLE))}", row.state)
+        _move(session, row, State.QUEUED, fresh | NO_ORDERS)
+        return to_job(row)
+
+
+def _move(session: Session, row: JobRow, state: State, values: Mapping[str, Any]) -> None:
+    _change(session, row, {"state": state, **values})
+    events.append(session, row.id, [events.state_event(state)])
+
+
+def _change(session: Session, row: JobRow, values: Mapping[str, Any]) -> None:
+    """Compare and set: on a database with row versions, another transaction may have moved the job since."""
+    unchanged: ColumnElement[bool] = (JobRow.id == row.id) & (JobRow.state == row.state)
+    change = update(JobRow).where(unchanged).values(**values).returning(JobRow.id)
+    if session.scalar(change, execution_options={"synchronize_session": False}) is None:
+        raise ConflictError("state", f"{row.state}, as read a moment ago", "another one")
+    session.refresh(row)

@@ -1,0 +1,109 @@
+"""Numbers of jobs: curves while they train, results and scores when they end, entries of tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from sqlalchemy import func, insert, select
+from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.orm import Session
+
+from services.errors import ConflictError
+from services.store.jobs import get, to_job
+from services.store.records import Claim, Outcome, Point, Score, State, TableEntry
+from services.store.session import Store, db_now
+from services.store.tables import JobRow, PointRow, ResultRow, ScoreRow
+
+CURVE_POINTS = 1000  # most points of one curve that leave the store
+DENORMALISED = ("psnr", "ssim", "flip", "lpips", "joint_mm", "sub_frame_joint_mm")
+
+
+def put_points(session: Session, job_id: str, points: Sequence[Point]) -> None:
+    """Insert or replace points inside the caller's transaction."""
+    if not points:
+        return
+    rows = [{"job_id": job_id, "key": p.key, "step": p.step, "value": p.value} for p in points]
+    dialect: Any = postgresql if session.get_bind().dialect.name == "postgresql" else sqlite
+    statement = dialect.insert(PointRow)
+    key = [PointRow.job_id, PointRow.key, PointRow.step]
+    replace = statement.on_conflict_do_update(index_elements=key, set_={"value": statement.excluded.value})
+    session.execute(replace, rows)
+
+
+def put_outcome(session: Session, claim: Claim, outcome: Outcome) -> None:
+    """Insert a result and its scores inside the transaction that ends the job."""
+    known = {name: outcome.means.get(name) for name in DENORMALISED}
+    row = ResultRow(
+        job_id=claim.job_id,
+        attempt=claim.attempt,
+        means=dict(outcome.means),
+        per_camera=dict(outcome.per_camera),
+        protocol=dict(outcome.protocol),
+        provenance=dict(outcome.provenance),
+        gaussians=outcome.gaussians,
+        train_seconds=outcome.train_seconds,
+        evaluate_seconds=outcome.evaluate_seconds,
+        created_at=session.scalar(select(db_now())),
+        **known,
+    )
+    session.add(row)
+    session.flush()
+    scores = [
+        {"job_id": claim.job_id, "camera": s.camera, "frame": s.frame, "metric": s.metric, "value": s.value}
+        for s in outcome.scores
+    ]
+    if scores:
+        session.execute(insert(ScoreRow), scores)
+
+
+def curves(store: Store, job_id: str) -> dict[str, list[tuple[int, float]]]:
+    """Curves of a job by key, thinned evenly to at most ``CURVE_POINTS`` each; first and last points are kept.
+
+    Raises:
+        NotFoundError: if there is no such job.
+    """
+    get(store, job_id)
+    number = func.row_number().over(partition_by=PointRow.key, order_by=PointRow.step) - 1
+    total = func.count().over(partition_by=PointRow.key)
+    ranked = select(PointRow.key, PointRow.step, PointRow.value, number.label("n"), total.label("total"))
+    inner = ranked.where(PointRow.job_id == job_id).subquery()
+    stride = inner.c.total // CURVE_POINTS + 1
+    thin = (inner.c.n % stride == 0) | (inner.c.n == inner.c.total - 1)
+    query = select(inner.c.key, inner.c.step, inner.c.value).where(thin).order_by(inner.c.key, inner.c.step)
+    found: dict[str, list[tuple[int, float]]] = {}
+    with store.read() as session:
+        for key, step, value in session.execute(query):
+            found.setdefault(key, []).append((step, value))
+    return found
+
+
+def outcome_of(store: Store, job_id: str) -> Outcome:
+    """The result of a succeeded job with its scores; artifacts are read by ``artifacts.of_job``.
+
+    Raises:
+        NotFoundError: if there is no such job.
+        ConflictError: if the job has no result.
+    """
+    with store.read() as session:
+        row = session.get(ResultRow, job_id)
+        if row is None:
+            raise ConflictError("state", "a succeeded job", get(store, job_id).state)
+        order = (ScoreRow.camera, ScoreRow.frame, ScoreRow.metric)
+        rows = session.scalars(select(ScoreRow).where(ScoreRow.job_id == job_id).order_by(*order))
+        scores = tuple(Score(s.camera, s.frame, s.metric, s.value) for s in rows)
+        numbers = (row.gaussians, row.train_seconds, row.evaluate_seconds)
+        return Outcome(row.means, row.per_camera, row.protocol, row.provenance, *numbers, scores)
+
+
+def table_entries(store: Store, preset: str | None = None) -> list[TableEntry]:
+    """The newest succeeded job of every spec, in the order of method, subject, seed and id."""
+    newest = select(func.max(JobRow.id)).where(JobRow.state == State.SUCCEEDED).group_by(JobRow.spec_sha256)
+    query = select(JobRow, ResultRow).join(ResultRow, ResultRow.job_id == JobRow.id).where(JobRow.id.in_(newest))
+    with store.read() as session:
+        entries = [
+            TableEntry(to_job(job), r.means, r.protocol, r.provenance, r.train_seconds, r.gaussians)
+            for job, r in session.execute(query)
+        ]
+    wanted = [e for e in entries if preset is None or e.job.spec.get("preset") == preset]
+    return sorted(wanted, key=lambda e: (e.job.method, e.job.subject, e.job.spec.get("seed", 0), e.job.id))

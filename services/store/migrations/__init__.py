@@ -1,0 +1,1 @@
+"""The database's versions: one file per step in ``versions``, applied by ``services.store.schema``."""

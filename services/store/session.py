@@ -1,0 +1,103 @@
+"""Engine, transactions and the database's clock, the same for SQLite and PostgreSQL."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection, Double, Engine, create_engine, event, select
+from sqlalchemy.engine.interfaces import DBAPIConnection
+from sqlalchemy.exc import ArgumentError
+from sqlalchemy.ext.compiler import compiles
+from sqlalchemy.orm import Session
+from sqlalchemy.pool import ConnectionPoolEntry
+from sqlalchemy.sql.functions import FunctionElement
+
+from services.errors import SettingsError
+from services.settings import Settings
+
+PRAGMAS = ("journal_mode=WAL", "foreign_keys=ON", "synchronous=NORMAL", "busy_timeout=60000", "cache_size=-20000")
+
+
+class db_now(FunctionElement[float]):  # noqa: N801  (reads as the SQL function that it is)
+    """Seconds since 1970 on the database's clock: leases must not depend on whose clock is right."""
+
+    type = Double()
+    inherit_cache = True
+    name = "db_now"
+
+
+@compiles(db_now, "sqlite")
+def _now_sqlite(element: Any, compiler: Any, **options: Any) -> str:
+    return "((julianday('now') - 2440587.5) * 86400.0)"
+
+
+@compiles(db_now, "postgresql")
+def _now_postgresql(element: Any, compiler: Any, **options: Any) -> str:
+    return "extract(epoch from clock_timestamp())::double precision"
+
+
+class Store:
+    """A database. ``read`` and ``write`` give a session inside one transaction; ``write`` commits at the end.
+
+    On SQLite a write transaction takes the write lock at once (BEGIN IMMEDIATE): one that reads first and writes
+    later could not wait for the lock and would fail with "database is locked".
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self.engine = open_engine(settings.database)
+        self.artifacts_dir: Path = settings.home / "artifacts"
+        self._writer = self.engine.execution_options(immediate=True)
+
+    @contextmanager
+    def read(self) -> Iterator[Session]:
+        """A session that sees one snapshot and writes nothing."""
+        with Session(self.engine) as session:
+            yield session
+
+    @contextmanager
+    def write(self) -> Iterator[Session]:
+        """A session that commits when the block ends, and rolls back when it raises."""
+        with Session(self._writer) as session, session.begin():
+            yield session
+
+    def now(self) -> float:
+        """The database's clock."""
+        with self.read() as session:
+            return float(session.scalar(select(db_now())) or 0.0)
+
+    def close(self) -> None:
+        """Give all connections back."""
+        self.engine.dispose()
+
+
+def open_engine(url: str) -> Engine:
+    """An engine with the service's profile for its kind of database.
+
+    Raises:
+        SettingsError: if ``url`` is not a database URL, or its driver is not installed.
+    """
+    try:
+        engine = create_engine(url, pool_pre_ping=not url.startswith("sqlite"))
+    except (ArgumentError, ModuleNotFoundError) as error:
+        wanted = "sqlite:///PATH or postgresql+psycopg://... with psycopg installed"
+        raise SettingsError("RSAVATAR_DATABASE_URL", wanted, error) from None
+    if engine.dialect.name == "sqlite":
+        event.listen(engine, "connect", _prepare_sqlite)
+        event.listen(engine, "begin", _begin_sqlite)
+    return engine
+
+
+def _prepare_sqlite(connection: DBAPIConnection, record: ConnectionPoolEntry) -> None:
+    connection.isolation_level = None  # the driver must not begin transactions on its own
+    cursor = connection.cursor()
+    for pragma in PRAGMAS:
+        cursor.execute(f"PRAGMA {pragma}")
+    cursor.close()
+
+
+def _begin_sqlite(connection: Connection) -> None:
+    immediate = connection.get_execution_options().get("immediate", False)
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")
