@@ -7,6 +7,7 @@ RsAvatarError
 ├── CheckpointError   a checkpoint is damaged, or belongs to another spec or code version
 ├── KernelError       the native kernels are missing, or refused their input
 ├── DivergedError     training left the finite numbers and could not be brought back
+├── ClientError       the service refused a request, or cannot be reached
 └── Interrupted       somebody asked the job to stop; its checkpoint is on disk
 """
 
@@ -39,6 +40,16 @@ class KernelError(RsAvatarError):
 
 class DivergedError(RsAvatarError):
     """Training left the finite numbers and could not be brought back."""
+
+
+class ClientError(RsAvatarError):
+    """The service refused a request, or cannot be reached; ``title`` and ``detail`` are those of its problem."""
+
+    def __init__(self, title: str, detail: str = "", status: int | None = None) -> None:
+        super().__init__(f"{title}: {detail}" if detail else title)
+        self.title = title
+        self.detail = detail
+        self.status = status
 
 
 class Interrupted(RsAvatarError):
