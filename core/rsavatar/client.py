@@ -1,0 +1,190 @@
+"""The service from Python: a thin, blocking client of ``/api/v1``. JSON in, JSON out, problems as ``ClientError``."""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import os
+import time
+import uuid
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+import httpx
+
+from rsavatar.errors import ClientError
+
+DEFAULT_URL = "http://127.0.0.1:8000"
+URL_VARIABLE = "RSAVATAR_URL"
+TERMINAL = frozenset({"succeeded", "failed", "dead", "cancelled"})  # states that a job leaves only by a retry
+SILENCE_SECONDS = 60.0  # an event stream says at least a comment more often than this
+PATIENCE_SECONDS = 120.0  # how long ``events`` looks for a service that went away
+PAUSE_SECONDS = 1.0  # between two looks, unless the stream asked for another pause
+
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class ServerEvent:
+    """One event of a stream: ``id`` grows, ``kind`` is the event's name, ``data`` its JSON."""
+
+    id: str
+    kind: str
+    data: Json
+
+
+class Client:
+    """A connection to one service. Use as a context manager, or ``close`` it.
+
+    Every method raises ``ClientError`` when the service refuses (its problem's title and detail) or cannot be reached.
+    """
+
+    def __init__(self, base_url: str | None = None, timeout_s: float = 30.0) -> None:
+        self.url = (base_url or os.environ.get(URL_VARIABLE) or DEFAULT_URL).rstrip("/")
+        try:
+            direct = _is_loopback(httpx.URL(self.url).host)  # a proxy cannot reach this machine's loopback
+            self._http = httpx.Client(base_url=f"{self.url}/api/v1", timeout=timeout_s, trust_env=not direct)
+        except httpx.InvalidURL as error:
+            raise ClientError(f"not an address: {self.url!r}", str(error)) from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give the connections back."""
+        self._http.close()
+
+    def submit(self, request: Mapping[str, Any], idempotency_key: str | None = None) -> Json:
+        """Queue a job; the same key and request give the same job. Returns the job."""
+        headers = {"Idempotency-Key": idempotency_key or str(uuid.uuid4())}
+        return self._json("POST", "/jobs", json=dict(request), headers=headers)
+
+    def job(self, job_id: str) -> Json:
+        """One job."""
+        return self._json("GET", f"/jobs/{job_id}")
+
+    def jobs(self, **filters: str) -> Iterator[Json]:
+        """Jobs, newest first, page after page; ``filters`` are state, method, subject, grid."""
+        parameters = dict(filters)
+        while True:
+            page = self._json("GET", "/jobs", params=parameters)
+            yield from page["items"]
+            if not page.get("next_cursor"):
+                return
+            parameters["cursor"] = page["next_cursor"]
+
+    def cancel(self, job_id: str) -> Json:
+        """Ask a job to stop. Returns the job."""
+        return self._json("POST", f"/jobs/{job_id}/cancel")
+
+    def retry(self, job_id: str) -> Json:
+        """Queue a finished, failed or cancelled job again; it goes on from its checkpoint. Returns the job."""
+        return self._json("POST", f"/jobs/{job_id}/retry")
+
+    def results(self, job_id: str) -> Json:
+        """What a succeeded job found: means, per camera, protocol, provenance."""
+        return self._json("GET", f"/jobs/{job_id}/results")
+
+    def table(self, name: str, fmt: str = "md") -> str:
+        """A result table as text in json, csv, md or tex."""
+        return self._request("GET", f"/tables/{name}.{fmt}").text
+
+    def subjects(self) -> list[Json]:
+        """The subjects that jobs may name."""
+        return list(self._json("GET", "/subjects")["items"])
+
+    def register_subject(self, name: str, path: str) -> Json:
+        """Make a folder on the service's machine known as a subject. Returns the subject."""
+        return self._json("POST", "/subjects", json={"name": name, "path": path})
+
+    def events(self, job_id: str, last_event_id: str | None = None) -> Iterator[ServerEvent]:
+        """Events of a job, from the beginning or after ``last_event_id``, until the job has ended.
+
+        A broken connection is taken up again after the last event seen, for ``PATIENCE_SECONDS`` of trying.
+        """
+        since = time.monotonic()
+        while True:
+            try:
+                for event in self._stream(job_id, last_event_id):
+                    last_event_id, since = event.id or last_event_id, time.monotonic()
+                    yield event
+                if self.job(job_id)["state"] in TERMINAL:
+                    return
+            except (httpx.TransportError, ClientError) as error:
+                refused = isinstance(error, ClientError) and error.status is not None and error.status < 500
+                if refused or time.monotonic() - since > PATIENCE_SECONDS:
+                    raise error if isinstance(error, ClientError) else self._unreachable(error) from None
+            time.sleep(PAUSE_SECONDS)
+
+    def _stream(self, job_id: str, last_event_id: str | None) -> Iterator[ServerEvent]:
+        headers = {"Accept": "text/event-stream"} | ({"Last-Event-ID": last_event_id} if last_event_id else {})
+        timeout = httpx.Timeout(self._http.timeout.connect, read=SILENCE_SECONDS)
+        with self._http.stream("GET", f"/jobs/{job_id}/events", headers=headers, timeout=timeout) as response:
+            if response.is_error:
+                response.read()
+                raise _problem(response)
+            yield from parse_events(response.iter_lines())
+
+    def _json(self, method: str, path: str, **options: Any) -> Json:
+        response = self._request(method, path, **options)
+        try:
+            value = response.json()
+        except ValueError:
+            value = None
+        if not isinstance(value, dict):
+            raise ClientError(f"{self.url} does not answer like this service", f"{method} {path} gave no JSON object")
+        return value
+
+    def _request(self, method: str, path: str, **options: Any) -> httpx.Response:
+        try:
+            response = self._http.request(method, path, **options)
+        except httpx.TransportError as error:
+            raise self._unreachable(error) from None
+        if not response.is_success:
+            raise _problem(response)
+        return response
+
+    def _unreachable(self, error: Exception) -> ClientError:
+        return ClientError(f"cannot reach {self.url}: is `make up` running?", str(error))
+
+
+def parse_events(lines: Iterable[str]) -> Iterator[ServerEvent]:
+    """The events of a ``text/event-stream`` (HTML standard, section 9.2.6); comments and unfinished events are dropped."""
+    last_id, kind, data = "", "message", []
+    for line in lines:
+        field, _, value = line.partition(":")
+        value = value.removeprefix(" ")
+        if not line:
+            if data:
+                yield ServerEvent(last_id, kind, json.loads("\n".join(data)))
+            kind, data = "message", []
+        elif field == "id":
+            last_id = value
+        elif field == "event":
+            kind = value
+        elif field == "data":
+            data.append(value)
+
+
+def _problem(response: httpx.Response) -> ClientError:
+    """A problem+json answer as an error; anything else by its status."""
+    try:
+        problem = response.json()
+    except ValueError:
+        problem = None
+    if not isinstance(problem, dict):
+        problem = {}
+    title = str(problem.get("title") or f"HTTP {response.status_code} {response.reason_phrase}".strip())
+    return ClientError(title, str(problem.get("detail") or ""), response.status_code)
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
