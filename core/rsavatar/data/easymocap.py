@@ -10,8 +10,10 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
+from rsavatar.body.skinning import easymocap_to_smplx, smplx_to_easymocap
 from rsavatar.data.annots import Calibration, numbers, parse_fit
 from rsavatar.data.base import Array, BodyFit
 from rsavatar.errors import DataError, expected
@@ -72,8 +74,8 @@ def to_smplx(fit: BodyFit, pelvis: Array) -> SmplxFit:
 
     ``pelvis`` [3] is p0, the first rest joint of the body shaped by ``fit.shapes``, metres.
     """
-    rotated = Rotation.from_rotvec(fit.Rh).apply(pelvis)
-    return SmplxFit(fit.Rh, fit.poses[:, 3:], fit.Th + rotated - pelvis, fit.shapes)
+    orient, transl = easymocap_to_smplx(*map(torch.from_numpy, (fit.Rh, fit.Th, pelvis)))
+    return SmplxFit(orient.numpy(), fit.poses[:, 3:], transl.numpy(), fit.shapes)
 
 
 def from_smplx(fit: SmplxFit, pelvis: Array) -> BodyFit:
@@ -82,9 +84,9 @@ def from_smplx(fit: SmplxFit, pelvis: Array) -> BodyFit:
     Raises:
         DataError: on wrong shapes or non-finite values.
     """
-    rotated = Rotation.from_rotvec(fit.global_orient).apply(pelvis)
+    Rh, Th = smplx_to_easymocap(*map(torch.from_numpy, (fit.global_orient, fit.transl, pelvis)))
     poses = np.concatenate([np.zeros((len(fit.body_pose), 3)), fit.body_pose], axis=1)
-    return BodyFit(poses, fit.global_orient, fit.transl + pelvis - rotated, fit.shapes)
+    return BodyFit(poses, Rh.numpy(), Th.numpy(), fit.shapes)
 
 
 def _read_frame(path: Path, person: int | None) -> BodyFit:

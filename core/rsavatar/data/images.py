@@ -32,6 +32,14 @@ class Lens:
         """False when undistorting would copy the image."""
         return bool(np.any(self.distortion != 0))
 
+    def scaled(self, factor: float) -> Lens:
+        """The same lens for images ``factor`` times as large."""
+        matrix = self.matrix.copy()
+        matrix[:2, 2] += 0.5
+        matrix[:2] *= factor
+        matrix[:2, 2] -= 0.5
+        return Lens(matrix, self.distortion)
+
     def undistorted(self, image: Bytes) -> Bytes:
         """The image an ideal pinhole camera of the same matrix would have taken (bilinear, black outside)."""
         if not self.distorts:
