@@ -8,7 +8,14 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rsavatar.geometry.rotations import compose, exp_so3, geodesic_distance, log_so3, quaternion_to_matrix
+from rsavatar.geometry.rotations import (
+    compose,
+    exp_so3,
+    geodesic_distance,
+    log_so3,
+    quaternion_to_matrix,
+    rotvec_distance,
+)
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -132,6 +139,20 @@ def test_distance_of_equal_rotations_has_zero_gradient() -> None:
     (gradient,) = torch.autograd.grad(distance.sum(), a)
     assert float(distance.detach().max()) < 1e-9
     assert float(gradient.abs().max()) < 1e-5  # rounding, over the guard's 1e-10
+
+
+def test_distance_of_vectors_is_the_distance_of_their_matrices() -> None:
+    a, b = 2 * vectors(50, seed=1), 2 * vectors(50, seed=2)
+    torch.testing.assert_close(rotvec_distance(a, b), geodesic_distance(exp_so3(a), exp_so3(b)), atol=1e-12, rtol=0)
+    assert torch.autograd.gradcheck(rotvec_distance, (a[:3].requires_grad_(), b[:3].requires_grad_()))
+
+
+def test_vectors_a_turn_apart_are_no_distance_apart_and_their_gradient_is_finite() -> None:
+    a = rotvecs(0.5).requires_grad_()
+    distance = rotvec_distance(a, rotvecs(0.5 - 2 * math.pi))
+    (gradient,) = torch.autograd.grad(distance.sum() + rotvec_distance(a, a).sum(), a)
+    assert float(distance.detach().max()) < 1e-9
+    assert gradient.isfinite().all()
 
 
 @settings(deadline=None, max_examples=50)

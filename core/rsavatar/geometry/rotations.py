@@ -55,8 +55,7 @@ def exp_so3(rotvec: Tensor) -> Tensor:
     Returns:
         [..., 3, 3]; differentiable everywhere, with the generators of SO(3) as the derivative at 0.
     """
-    half = (0.25 * (rotvec * rotvec).sum(-1, keepdim=True) + _TINY).sqrt()
-    return _from_unit_quaternion(torch.cat([half.cos(), rotvec * (0.5 * half.sin() / half)], -1))
+    return _from_unit_quaternion(torch.cat(_half_angles(rotvec), -1))
 
 
 def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
@@ -101,9 +100,26 @@ def geodesic_distance(first: Tensor, second: Tensor) -> Tensor:
     return torch.atan2((squared_sine + _TINY).sqrt(), cosine)
 
 
+def rotvec_distance(first: Tensor, second: Tensor) -> Tensor:
+    """``geodesic_distance(exp_so3(first), exp_so3(second))`` [...] of axis-angle vectors [..., 3], at half the price.
+
+    Twice the angle between the two unit quaternions, from the sine and cosine of their relative rotation.
+    """
+    (c1, v1), (c2, v2) = _half_angles(first), _half_angles(second)
+    vector = c1 * v2 - c2 * v1 - torch.cross(v1, v2, dim=-1)
+    scalar = c1[..., 0] * c2[..., 0] + (v1 * v2).sum(-1)
+    return 2 * torch.atan2(((vector * vector).sum(-1) + _TINY).sqrt(), scalar.abs())
+
+
 def compose(first: Tensor, second: Tensor) -> Tensor:
     """Axis-angle vector [..., 3] of ``exp(first) exp(second)``: ``second`` acts first. Length at most pi."""
     return log_so3(exp_so3(first) @ exp_so3(second))
+
+
+def _half_angles(rotvec: Tensor) -> tuple[Tensor, Tensor]:
+    """The unit quaternion of an axis-angle vector [..., 3]: cos(h) [..., 1] and sin(h) a [..., 3], h half the angle."""
+    half = (0.25 * (rotvec * rotvec).sum(-1, keepdim=True) + _TINY).sqrt()
+    return half.cos(), rotvec * (0.5 * half.sin() / half)
 
 
 def _from_unit_quaternion(unit: Tensor) -> Tensor:

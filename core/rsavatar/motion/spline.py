@@ -12,7 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rsavatar.geometry.rotations import exp_so3, geodesic_distance
+from rsavatar.geometry.rotations import rotvec_distance
 from rsavatar.motion.base import JOINTS, AbstractMotion, BodyState, Continuity, InitialMotion, split
 
 Perturbation = Literal["zero-mean", "positive"]
@@ -46,6 +46,7 @@ class FrameSpline(AbstractMotion):
     """
 
     basis: Tensor  # [P, P] float64
+    meeting: Tensor  # [N - 1] weights of the pairs (n, n + 1): equal where their windows meet, else 0; they sum to 1
 
     def __init__(
         self, initial: InitialMotion, bands: int, P: int = 4, perturbation: Perturbation = "zero-mean", seed: int = 0
@@ -57,7 +58,10 @@ class FrameSpline(AbstractMotion):
         self.readout = initial.readout_frames
         self.bands = bands
         self.register_buffer("basis", basis_matrix(P), persistent=False)
-        self.register_buffer("mid_frames", torch.as_tensor(initial.mid_frames, dtype=torch.float64), persistent=False)
+        mids = torch.as_tensor(initial.mid_frames, dtype=torch.float64)
+        meeting = ((mids.diff() - self.period).abs() < 1e-6 * self.period).double()
+        self.register_buffer("mid_frames", mids, persistent=False)
+        self.register_buffer("meeting", meeting / meeting.sum().clamp_min(1), persistent=False)
 
     def state(self, frame: int, offsets: Tensor) -> BodyState:
         """States [D] of frame ``frame`` at ``offsets`` [D] source frames from its mid time: one product for all."""
@@ -73,33 +77,25 @@ class FrameSpline(AbstractMotion):
     def penalty(self, kind: Continuity) -> Tensor:
         """Mean gap between the end of each frame's trajectory and the start of the next frame's, radians.
 
-        ``"paper"`` (eq. reg) compares the last band's instant of frame n with the first band's of n + 1, which are
-        1 / T of a readout apart: it also holds back true motion, by up to that step. ``"aligned"`` compares both
+        ``"paper"`` (eq. reg) compares the last band's instant of frame n with the first band's of n + 1. These are not
+        the same instant (1 / T of a readout apart, and more where the readout is shorter than the period), so it also
+        pulls true motion towards none. ``"aligned"`` compares both
         trajectories at the one instant where their windows meet (u = 1 and u = 0), and adds the distance of the two
         translations there, metres, with weight 1. Rh counts as joint 0. Only frames whose windows meet are compared.
         """
         reach = 0.5 if kind == "aligned" else 0.5 * (self.bands - 1) / self.bands * self.readout / self.period
         ends = self._weights(torch.tensor([0.5 + reach, 0.5 - reach], dtype=torch.float64, device=self.control.device))
-        meeting = self._meeting()
-        if not len(meeting):
-            return self.control.new_zeros(())
-        last = torch.einsum("p,npjc->njc", ends[0], self.control[meeting])
-        first = torch.einsum("p,npjc->njc", ends[1], self.control[meeting + 1])
-        R = exp_so3(torch.stack([last, first])[:, :, :JOINTS])
-        gap = geodesic_distance(R[0], R[1]).mean()
+        last, first = torch.einsum("ep,npjc->enjc", ends, self.control)
+        last, first = last[:-1], first[1:]
+        gap = rotvec_distance(last[:, :JOINTS], first[:, :JOINTS]).mean(-1)
         if kind == "aligned":
-            gap = gap + ((last[:, JOINTS] - first[:, JOINTS]).square().sum(-1) + _TINY).sqrt().mean()
-        return gap
+            gap = gap + ((last[:, JOINTS] - first[:, JOINTS]).square().sum(-1) + _TINY).sqrt()
+        return (gap * self.meeting.to(gap.dtype)).sum()
 
     def _weights(self, u: Tensor) -> Tensor:
         """Weights [..., P] of the control points at ``u`` [...], which may leave [0, 1]."""
         powers = u[..., None] ** torch.arange(len(self.basis), device=u.device)
         return (powers.to(self.basis) @ self.basis).to(self.control.dtype)
-
-    def _meeting(self) -> Tensor:
-        """Indices n of the frames whose window ends where that of n + 1 starts."""
-        gaps = self.mid_frames[1:] - self.mid_frames[:-1]
-        return torch.nonzero((gaps - self.period).abs() < 1e-6 * self.period)[:, 0]
 
 
 def _noise(shape: torch.Size, perturbation: Perturbation, seed: int) -> Tensor:
