@@ -154,8 +154,9 @@ class Client:
 
 
 def parse_events(lines: Iterable[str]) -> Iterator[ServerEvent]:
-    """The events of a ``text/event-stream`` (HTML standard, section 9.2.6); comments and unfinished events are dropped."""
-    last_id, kind, data = "", "message", []
+    """The events of a ``text/event-stream`` (HTML standard, section 9.2.6); comments and cut events are dropped."""
+    last_id, kind = "", "message"
+    data: list[str] = []
     for line in lines:
         field, _, value = line.partition(":")
         value = value.removeprefix(" ")

@@ -1,0 +1,172 @@
+"""The command line. This file knows the words; the verbs, and what is heavy, are imported when they are said."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from rsavatar import __version__
+from rsavatar.errors import RsAvatarError
+
+EXIT_BAD, EXIT_STOPPED = 2, 130  # a named error; interrupted from the keyboard
+
+MAIN = """\
+examples:
+  rsavatar run smoke --set method=rs-avatar --set subject=studio     seconds, on a subject that is made on the spot
+  rsavatar run draft --set method=gauhuman --subject-dir data/wave   minutes, on your subject
+  rsavatar data check data/wave                                      is the subject fit for training?
+  rsavatar submit draft --set method=rs-avatar --set subject=wave    the same through the service (`make up`)
+  rsavatar table main --format tex                                   the results, for the paper
+
+`rsavatar VERB --help` explains a verb.
+"""
+RUN = """\
+SPEC is a TOML file or the name of a preset (smoke, draft, paper). A file holds the words of a job:
+
+  preset = "draft"        # values that are not named come from here
+  method = "rs-avatar"    # rs-avatar | gauhuman | mad-avatar
+  T = "scanline"          # row bands: a number, "K", "2K", or "scanline"
+
+examples:
+  rsavatar run job.toml --subject-dir data/wave --out runs/wave
+  rsavatar run paper --set method=mad-avatar --set T=11 --subject-dir data/wave
+  rsavatar run draft --set method=rs-avatar --set ablation.no_rs=true --set seed=1 --subject-dir data/wave
+
+Ctrl-C stops at the next step and writes a checkpoint; the same command goes on from it, to the same numbers.
+OUT holds checkpoint.safetensors, metrics.json, motion.npz and predictions/<camera>/<frame>.png.
+"""
+SUBMIT = """\
+examples:
+  rsavatar submit draft --set method=rs-avatar --set subject=wave
+  rsavatar submit job.toml --key wave-seed-0 --watch        the same key never makes a second job
+
+Prints the job's id. SPEC and --set are those of `rsavatar run`.
+"""
+CHECK = """\
+Reads files, cameras, timing and masks, projects the fitted body into sampled masks, and names the usual mistakes:
+metres for millimetres, Rh taken for global_orient, files that are missing. Exit status 1 when unfit.
+
+example:
+  rsavatar data check data/CoreView_377
+"""
+WATCH = (
+    "Follows a job's progress and prints its results. A broken connection is taken up again. Ctrl-C only stops looking."
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb. Returns the exit status: 0 done, 1 done with a bad answer, 2 an error, 130 interrupted."""
+    arguments = _parser().parse_args(argv)
+    module, _, name = str(arguments.verb).partition(":")
+    try:
+        verb: Callable[[argparse.Namespace], int] = getattr(importlib.import_module(module), name)
+        return verb(arguments)
+    except RsAvatarError as error:
+        if arguments.debug:
+            raise
+        return _fail(str(error))
+    except ModuleNotFoundError as error:
+        if arguments.debug or str(error.name).startswith("rsavatar"):
+            raise
+        return _fail(f"{error.name} is not installed: pip install 'rsavatar[core,client]'")
+    except KeyboardInterrupt:
+        return EXIT_STOPPED
+    except BrokenPipeError:  # the reader, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_STOPPED
+
+
+def _fail(sentence: str) -> int:
+    print(f"error: {sentence}", file=sys.stderr)
+    return EXIT_BAD
+
+
+def _parser() -> argparse.ArgumentParser:
+    about = "Animatable 3D Gaussian avatars from rolling-shutter video."
+    parser = argparse.ArgumentParser("rsavatar", description=about, epilog=MAIN, formatter_class=_Layout)
+    parser.add_argument("--version", action="version", version=f"rsavatar {__version__}")
+    parser.set_defaults(debug=False)
+    verbs = parser.add_subparsers(required=True, metavar="VERB", title="verbs")
+    _add_local(verbs)
+    _add_remote(verbs)
+    return parser
+
+
+def _add_local(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    run = _add(verbs, "run", "rsavatar.cli_local:run", "reconstruct one subject on this machine", RUN)
+    _add_request(run)
+    run.add_argument("--subject-dir", type=Path, metavar="DIR", help="the subject's folder; its name names the subject")
+    run.add_argument("--out", type=Path, metavar="DIR", help="where to write (default: runs/SUBJECT-METHOD-HASH)")
+
+    bench = _add(verbs, "bench", "rsavatar.cli_local:bench", "measure speed or stability on this machine")
+    bench.add_argument("name", choices=["render", "train", "stability"])
+    bench.add_argument("--json", type=Path, metavar="FILE", help="write the figures here as well")
+
+    nouns = verbs.add_parser("data", help="look at or make subjects").add_subparsers(required=True, metavar="VERB")
+    check = _add(nouns, "check", "rsavatar.cli_local:check", "is a subject fit for training?", CHECK)
+    check.add_argument("directory", type=Path, metavar="DIR")
+    check.add_argument("--body", default="auto", help="auto, anny, or an SMPL-format .npz or .pkl (default: auto)")
+    studio = _add(nouns, "studio", "rsavatar.cli_local:studio", "make the built-in subject, without any download")
+    studio.add_argument("directory", type=Path, metavar="OUT")
+
+
+def _add_remote(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    submit = _add(verbs, "submit", "rsavatar.cli_remote:submit", "queue a job", SUBMIT)
+    _add_request(submit)
+    submit.add_argument("--key", help="idempotency key (default: a fresh one)")
+    submit.add_argument("--watch", action="store_true", help="stay and follow it")
+
+    _add_id(_add(verbs, "watch", "rsavatar.cli_remote:watch", "follow a job until it ends", WATCH))
+    _add_id(_add(verbs, "cancel", "rsavatar.cli_remote:cancel", "stop a job"))
+    _add_id(_add(verbs, "retry", "rsavatar.cli_remote:retry", "queue a failed or cancelled job again"))
+
+    jobs = _add(verbs, "jobs", "rsavatar.cli_remote:jobs", "list jobs, newest first")
+    for name in ("state", "method", "subject"):
+        jobs.add_argument(f"--{name}")
+    jobs.add_argument("--limit", type=int, default=50, metavar="N", help="at most N jobs (default: 50)")
+
+    table = _add(verbs, "table", "rsavatar.cli_remote:table", "print a table of results")
+    table.add_argument("name", help="main or per-subject")
+    table.add_argument("--format", choices=["json", "csv", "md", "tex"], default="md", help="default: md")
+
+    subjects = _add(verbs, "subjects", "rsavatar.cli_remote:subjects", "list subjects, or make one known")
+    subjects.add_argument("--add", nargs=2, metavar=("NAME", "PATH"), help="a folder on the service's machine")
+    for parser in (submit, jobs, table, subjects, *(verbs.choices[n] for n in ("watch", "cancel", "retry"))):
+        parser.add_argument("--url", help="the service (default: $RSAVATAR_URL, else http://127.0.0.1:8000)")
+
+
+def _add(
+    verbs: argparse._SubParsersAction[argparse.ArgumentParser], name: str, verb: str, about: str, epilog: str = ""
+) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = verbs.add_parser(
+        name, help=about, description=f"{about[0].upper()}{about[1:]}.", epilog=epilog, formatter_class=_Layout
+    )
+    parser.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help="show tracebacks")
+    parser.set_defaults(verb=verb)
+    return parser
+
+
+def _add_request(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("spec", metavar="SPEC", help="a TOML file, or a preset: smoke, draft, paper")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="one word of the job; repeatable"
+    )
+
+
+def _add_id(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("job_id", metavar="ID")
+
+
+class _Layout(argparse.RawDescriptionHelpFormatter):
+    """Epilogs as they are written, columns wide enough for the verbs."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=28, width=100)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,82 @@
+"""Verbs that work on this machine: run, bench, data."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+
+from rsavatar.errors import Interrupted, SpecError
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """``rsavatar run``: one job, to the end or to the next Ctrl-C."""
+    from rsavatar import experiment
+    from rsavatar.cli_progress import Display, print_means
+    from rsavatar.cli_request import read_request
+    from rsavatar.events import to_json
+    from rsavatar.spec import resolve
+
+    spec = resolve(read_request(arguments.spec, arguments.set, arguments.subject_dir))
+    out: Path = arguments.out or Path("runs") / f"{spec.subject}-{spec.method}-{spec.sha256()[:8]}"
+    try:
+        with stop_on_signal() as stop, Display() as display:
+            result = experiment.run(
+                spec, out, arguments.subject_dir, lambda event: display.show(to_json(event)), stop.is_set
+            )
+    except Interrupted:
+        print(f"stopped; the checkpoint is in {out}\nthe same command with --out {out} goes on from there")
+        return 130
+    cost = f"{result.gaussians} Gaussians, trained in {result.train_seconds:.0f} s"
+    print_means(f"{spec.method} on {spec.subject}: {cost}", result.means, result.protocol)
+    for name, path in result.artifacts.items():
+        print(f"{name:<12} {path}")
+    return 0
+
+
+def bench(arguments: argparse.Namespace) -> int:
+    """``rsavatar bench``: one benchmark, by name."""
+    place = f"rsavatar.bench.{arguments.name}"
+    try:
+        module = importlib.import_module(place)
+    except ModuleNotFoundError as error:
+        if error.name not in {"rsavatar.bench", place}:
+            raise
+        raise SpecError(f"bench {arguments.name}: not available in this version") from None
+    return int(module.main(arguments.json) or 0)
+
+
+def check(arguments: argparse.Namespace) -> int:
+    """``rsavatar data check``: the findings, and status 1 where an error is among them."""
+    from rsavatar.data import check as checking
+
+    report = checking.check(arguments.directory, arguments.body)
+    print(checking.render(report))
+    return 0 if report.ok else 1
+
+
+@contextmanager
+def stop_on_signal() -> Iterator[threading.Event]:
+    """An event that the first SIGINT or SIGTERM sets; the second acts as if nothing had been caught."""
+    stop = threading.Event()
+    former = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def restore() -> None:
+        for number, handler in former.items():
+            signal.signal(number, handler)
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        stop.set()
+        restore()
+
+    for number in former:
+        signal.signal(number, ask)
+    try:
+        yield stop
+    finally:
+        restore()
