@@ -48,6 +48,8 @@ class Display:
             self._progress(event)
         elif event["kind"] == "note":
             self._console.print(str(event["text"]), markup=False)
+        elif event["kind"] == "state":
+            self._console.print(f"job is {event['state']}", markup=False)
 
     def _progress(self, event: Mapping[str, Any]) -> None:
         stage, step, steps, state = str(event["stage"]), int(event["step"]), int(event["steps"]), _state(event)

@@ -30,6 +30,7 @@ def watch(arguments: argparse.Namespace) -> int:
 def jobs(arguments: argparse.Namespace) -> int:
     """``rsavatar jobs``: a line per job, newest first."""
     filters = {k: v for k in ("state", "method", "subject") if (v := getattr(arguments, k)) is not None}
+    filters["limit"] = str(max(1, min(arguments.limit, 200)))
     with Client(arguments.url) as client:
         for job in itertools.islice(client.jobs(**filters), arguments.limit):
             print(_line(job))
@@ -81,6 +82,7 @@ def _follow(client: Client, job_id: str) -> int:
 
 
 def _line(job: dict[str, Any]) -> str:
-    progress = f"{job.get('step') or 0}/{job['steps']}" if job.get("steps") else ""
-    words = f"{job['id']}  {job['state']:<10} {job['method']:<12} {job['subject']:<16} {progress:<13}"
-    return f"{words} {job.get('error') or ''}".rstrip()
+    look, error = job["progress"], job["error"]
+    progress = f"{look['stage'] or ''} {look['step']}/{look['steps']}" if look["steps"] else ""
+    words = f"{job['id']}  {job['state']:<10} {job['method']:<12} {job['subject']:<16} {progress:<22}"
+    return f"{words} {error['message'] if error else ''}".rstrip()

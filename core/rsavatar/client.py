@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
+from urllib.parse import quote
 
 import httpx
 
@@ -62,14 +63,16 @@ class Client:
     def submit(self, request: Mapping[str, Any], idempotency_key: str | None = None) -> Json:
         """Queue a job; the same key and request give the same job. Returns the job."""
         headers = {"Idempotency-Key": idempotency_key or str(uuid.uuid4())}
-        return self._json("POST", "/jobs", json=dict(request), headers=headers)
+        job: Json = self._json("POST", "/jobs", json=dict(request), headers=headers)
+        return job
 
     def job(self, job_id: str) -> Json:
         """One job."""
-        return self._json("GET", f"/jobs/{job_id}")
+        job: Json = self._json("GET", _path("jobs", job_id))
+        return job
 
     def jobs(self, **filters: str) -> Iterator[Json]:
-        """Jobs, newest first, page after page; ``filters`` are state, method, subject, grid."""
+        """Jobs, newest first, page after page; ``filters`` are state, method, subject, grid, limit (a page)."""
         parameters = dict(filters)
         while True:
             page = self._json("GET", "/jobs", params=parameters)
@@ -80,40 +83,46 @@ class Client:
 
     def cancel(self, job_id: str) -> Json:
         """Ask a job to stop. Returns the job."""
-        return self._json("POST", f"/jobs/{job_id}/cancel")
+        job: Json = self._json("POST", _path("jobs", job_id, "cancel"))
+        return job
 
     def retry(self, job_id: str) -> Json:
         """Queue a finished, failed or cancelled job again; it goes on from its checkpoint. Returns the job."""
-        return self._json("POST", f"/jobs/{job_id}/retry")
+        job: Json = self._json("POST", _path("jobs", job_id, "retry"))
+        return job
 
     def results(self, job_id: str) -> Json:
         """What a succeeded job found: means, per camera, protocol, provenance."""
-        return self._json("GET", f"/jobs/{job_id}/results")
+        results: Json = self._json("GET", _path("jobs", job_id, "results"))
+        return results
 
     def table(self, name: str, fmt: str = "md") -> str:
         """A result table as text in json, csv, md or tex."""
-        return self._request("GET", f"/tables/{name}.{fmt}").text
+        return self._request("GET", _path("tables", f"{name}.{fmt}")).text
 
     def subjects(self) -> list[Json]:
         """The subjects that jobs may name."""
-        return list(self._json("GET", "/subjects")["items"])
+        return list(self._json("GET", "/subjects"))
 
     def register_subject(self, name: str, path: str) -> Json:
         """Make a folder on the service's machine known as a subject. Returns the subject."""
-        return self._json("POST", "/subjects", json={"name": name, "path": path})
+        subject: Json = self._json("POST", "/subjects", json={"name": name, "path": path})
+        return subject
 
     def events(self, job_id: str, last_event_id: str | None = None) -> Iterator[ServerEvent]:
         """Events of a job, from the beginning or after ``last_event_id``, until the job has ended.
 
         A broken connection is taken up again after the last event seen, for ``PATIENCE_SECONDS`` of trying.
         """
-        since = time.monotonic()
+        since, ended = time.monotonic(), False
         while True:
             try:
+                idle = True
                 for event in self._stream(job_id, last_event_id):
-                    last_event_id, since = event.id or last_event_id, time.monotonic()
+                    last_event_id, since, idle = event.id or last_event_id, time.monotonic(), False
+                    ended = event.kind == "state" and event.data.get("state") in TERMINAL
                     yield event
-                if self.job(job_id)["state"] in TERMINAL:
+                if ended or (idle and self.job(job_id)["terminal"]):
                     return
             except (httpx.TransportError, ClientError) as error:
                 refused = isinstance(error, ClientError) and error.status is not None and error.status < 500
@@ -124,21 +133,21 @@ class Client:
     def _stream(self, job_id: str, last_event_id: str | None) -> Iterator[ServerEvent]:
         headers = {"Accept": "text/event-stream"} | ({"Last-Event-ID": last_event_id} if last_event_id else {})
         timeout = httpx.Timeout(self._http.timeout.connect, read=SILENCE_SECONDS)
-        with self._http.stream("GET", f"/jobs/{job_id}/events", headers=headers, timeout=timeout) as response:
+        with self._http.stream("GET", _path("jobs", job_id, "events"), headers=headers, timeout=timeout) as response:
             if response.is_error:
                 response.read()
                 raise _problem(response)
-            yield from parse_events(response.iter_lines())
+            try:
+                yield from parse_events(response.iter_lines())
+            except ValueError as error:
+                raise self._stranger(f"events that are not JSON: {error}", 200) from None
 
-    def _json(self, method: str, path: str, **options: Any) -> Json:
+    def _json(self, method: str, path: str, **options: Any) -> Any:
         response = self._request(method, path, **options)
         try:
-            value = response.json()
+            return response.json()
         except ValueError:
-            value = None
-        if not isinstance(value, dict):
-            raise ClientError(f"{self.url} does not answer like this service", f"{method} {path} gave no JSON object")
-        return value
+            raise self._stranger(f"{method} {path} gave no JSON", response.status_code) from None
 
     def _request(self, method: str, path: str, **options: Any) -> httpx.Response:
         try:
@@ -148,6 +157,9 @@ class Client:
         if not response.is_success:
             raise _problem(response)
         return response
+
+    def _stranger(self, detail: str, status: int) -> ClientError:
+        return ClientError(f"{self.url} does not answer like this service", detail, status)
 
     def _unreachable(self, error: Exception) -> ClientError:
         return ClientError(f"cannot reach {self.url}: is `make up` running?", str(error))
@@ -170,6 +182,10 @@ def parse_events(lines: Iterable[str]) -> Iterator[ServerEvent]:
             kind = value
         elif field == "data":
             data.append(value)
+
+
+def _path(*parts: str) -> str:
+    return "".join("/" + quote(part, safe="") for part in parts)
 
 
 def _problem(response: httpx.Response) -> ClientError:
