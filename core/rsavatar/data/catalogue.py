@@ -25,8 +25,6 @@ def open_subject(name: str, directory: Path | None) -> Subject:
         from rsavatar.data.studio import studio_subject_dir
 
         directory = studio_subject_dir()
-    if not directory.is_dir():
-        raise DataError(expected(f"subject {name!r}", f"a folder {directory}", "nothing there"))
     subject: Subject = load_named(DATASETS, layout_of(directory))(directory)
     return subject
 
@@ -37,6 +35,8 @@ def layout_of(directory: Path) -> str:
     Raises:
         DataError: saying what was looked for and what is there.
     """
+    if not directory.is_dir():
+        raise DataError(expected(str(directory), "a subject's folder", "nothing there"))
     if (directory / "meta.json").is_file() and (directory / "rs").is_dir():
         return "rolling"
     pictures = (directory / "images").is_dir() or any(directory.glob("Camera*"))
