@@ -7,7 +7,7 @@ import json
 import os
 import time
 import uuid
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
@@ -45,10 +45,13 @@ class Client:
     def __init__(self, base_url: str | None = None, timeout_s: float = 30.0) -> None:
         self.url = (base_url or os.environ.get(URL_VARIABLE) or DEFAULT_URL).rstrip("/")
         try:
-            direct = _is_loopback(httpx.URL(self.url).host)  # a proxy cannot reach this machine's loopback
-            self._http = httpx.Client(base_url=f"{self.url}/api/v1", timeout=timeout_s, trust_env=not direct)
+            url = httpx.URL(self.url)
         except httpx.InvalidURL as error:
             raise ClientError(f"not an address: {self.url!r}", str(error)) from None
+        if url.scheme not in {"http", "https"} or not url.host:
+            raise ClientError(f"not an address: {self.url!r}", "expected http://HOST:PORT")
+        direct = _is_loopback(url.host)  # a proxy cannot reach this machine's loopback
+        self._http = httpx.Client(base_url=f"{self.url}/api/v1", timeout=timeout_s, trust_env=not direct)
 
     def __enter__(self) -> Self:
         return self
@@ -109,7 +112,7 @@ class Client:
         subject: Json = self._json("POST", "/subjects", json={"name": name, "path": path})
         return subject
 
-    def events(self, job_id: str, last_event_id: str | None = None) -> Iterator[ServerEvent]:
+    def events(self, job_id: str, last_event_id: str | None = None) -> Generator[ServerEvent, None, None]:
         """Events of a job, from the beginning or after ``last_event_id``, until the job has ended.
 
         A broken connection is taken up again after the last event seen, for ``PATIENCE_SECONDS`` of trying.
