@@ -105,9 +105,8 @@ def page(store: Store, filters: Filters, before: str | None, limit: int) -> list
 def count_by_state(store: Store) -> dict[str, int]:
     """Number of jobs in every state, zeros included."""
     with store.read() as session:
-        found = {
-            state: count for state, count in session.execute(select(JobRow.state, func.count()).group_by(JobRow.state))
-        }
+        rows = session.execute(select(JobRow.state, func.count()).group_by(JobRow.state))
+        found = dict(rows.tuples().all())
     return {str(state): found.get(state, 0) for state in State}
 
 

@@ -1,0 +1,116 @@
+"""Jobs: submit, list, look at, steer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Header, Query, Response
+from fastapi.responses import PlainTextResponse
+
+from services import jobs as wake_up
+from services.api.deps import Back, JobId
+from services.api.requests import JobQuery, JobRequest, checked_key
+from services.api.views import ArtifactView, JobDetail, JobPage, JobView, ResultView
+from services.errors import NotFoundError, RequestError
+from services.store import artifacts, jobs, metrics, subjects
+from services.store.records import Filters, Job, State, Submission
+from services.store.session import Store
+
+LOG_BYTES = 65_536
+Verb = Literal["cancel", "pause", "resume", "retry"]
+VERBS: dict[str, Callable[[Store, str], Job]] = {
+    "cancel": jobs.cancel,
+    "pause": jobs.pause,
+    "resume": jobs.resume,
+    "retry": jobs.retry,
+}
+
+router = APIRouter(prefix="/jobs", tags=["jobs"])
+
+
+@router.post("", status_code=202, responses={200: {"model": JobDetail, "description": "the key's earlier job"}})
+def submit(
+    request: JobRequest,
+    response: Response,
+    back: Back,
+    idempotency_key: Annotated[str | None, Header(description="repeat it to repeat a request safely")] = None,
+) -> JobDetail:
+    """Accept a job: 202 and its place. A repeated Idempotency-Key gives the first job back, 200."""
+    key = checked_key(idempotency_key)
+    spec = request.resolve()
+    try:
+        subjects.get(back.store, spec.subject)
+    except NotFoundError as error:
+        raise RequestError(error.name, error.expected, error.got) from None
+    stored = spec.model_dump(mode="json", by_alias=True)
+    limits = back.settings.max_attempts
+    job, is_new = jobs.submit(back.store, Submission(stored, spec.sha256(), request.sha256(), limits, key))
+    if is_new:
+        wake_up.enqueue(back.broker, job.id)
+    response.status_code = 202 if is_new else 200
+    response.headers["location"] = f"/api/v1/jobs/{job.id}"
+    return JobDetail.of(job)
+
+
+@router.get("")
+def list_jobs(query: Annotated[JobQuery, Query()], back: Back) -> JobPage:
+    """Jobs, newest first."""
+    filters = Filters(query.state, query.method, query.subject, query.grid)
+    found = jobs.page(back.store, filters, query.cursor, query.limit + 1)
+    shown = found[: query.limit]
+    is_last = len(found) <= query.limit
+    return JobPage(items=[JobView.of(job) for job in shown], next_cursor=None if is_last else shown[-1].id)
+
+
+@router.get("/{job_id}")
+def get_job(job_id: JobId, back: Back) -> JobDetail:
+    """One job with its complete spec."""
+    return JobDetail.of(jobs.get(back.store, job_id))
+
+
+@router.post("/{job_id}/{verb}", status_code=202)
+def steer(job_id: JobId, verb: Verb, back: Back) -> JobDetail:
+    """Cancel, pause, resume or retry. A running job is asked, and leaves a checkpoint before it stops."""
+    job = VERBS[verb](back.store, job_id)
+    if job.state == State.QUEUED:
+        wake_up.enqueue(back.broker, job.id)
+    return JobDetail.of(job)
+
+
+@router.get("/{job_id}/metrics")
+def get_metrics(job_id: JobId, back: Back) -> dict[str, list[tuple[int, float]]]:
+    """Training curves by name: [step, value] pairs, thinned evenly."""
+    return metrics.curves(back.store, job_id)
+
+
+@router.get("/{job_id}/results")
+def get_results(job_id: JobId, back: Back) -> ResultView:
+    """What a succeeded job found; 409 for any other."""
+    return ResultView.of(metrics.outcome_of(back.store, job_id))
+
+
+@router.get("/{job_id}/artifacts")
+def get_artifacts(job_id: JobId, back: Back) -> list[ArtifactView]:
+    """Files of a job."""
+    return [ArtifactView.of(artifact) for artifact in artifacts.of_job(back.store, job_id)]
+
+
+@router.get("/{job_id}/log", response_class=PlainTextResponse)
+def get_log(
+    job_id: JobId,
+    back: Back,
+    offset: Annotated[int | None, Query(ge=0, description="byte to read from; none = the end")] = None,
+) -> PlainTextResponse:
+    """Up to 64 KiB of the log; ``X-Next-Offset`` says where to go on."""
+    jobs.get(back.store, job_id)
+    path = back.settings.job_dir(job_id) / "log.txt"
+    if not path.is_file():
+        return PlainTextResponse("", headers={"x-next-offset": "0"})
+    with path.open("rb") as file:
+        size = file.seek(0, 2)
+        start = max(0, size - LOG_BYTES) if offset is None else min(offset, size)
+        file.seek(start)
+        block = file.read(LOG_BYTES)
+    text = block.decode("utf-8", "replace")
+    return PlainTextResponse(text, headers={"x-next-offset": str(start + len(block))})

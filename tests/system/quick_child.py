@@ -1,0 +1,96 @@
+"""A real child process with a quick computation in place of training: it counts, and its count is checkable.
+
+It keeps the contract of ``rsavatar.experiment.run``: progress, checkpoints by rename, resume, SIGTERM. What it does
+on the way is chosen by the spec's seed, so that one program serves all tests.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from rsavatar import errors, events
+from rsavatar.experiment import Result, Score
+from rsavatar.spec import JobSpec
+
+from services.worker.child import serve
+
+STEP_SECONDS = 0.01
+KILLS_ITSELF_ONCE, DIVERGES, HAS_A_BUG, HANGS, ALWAYS_DIES = 101, 102, 103, 104, 105
+PNG = bytes.fromhex(
+    "89504e470d0a1a0a0000000d4948445200000001000000010804000000b51c0c02"
+    "0000000b4944415478da6364f80f00010501012718e3660000000049454e44ae426082"
+)
+
+
+def chain(state: str, step: int) -> str:
+    """A value that depends on every step before: a resumed job that lost or repeated one ends elsewhere."""
+    return hashlib.sha256(f"{state}:{step}".encode()).hexdigest()
+
+
+def misbehave(spec: JobSpec, out: Path, step: int) -> None:
+    if step != spec.iterations // 2:
+        return
+    if spec.seed == ALWAYS_DIES:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if spec.seed == KILLS_ITSELF_ONCE and not (out / "died").exists():
+        (out / "died").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    if spec.seed == DIVERGES:
+        raise errors.DivergedError("loss: expected a finite number, got nan")
+    if spec.seed == HAS_A_BUG:
+        raise ZeroDivisionError("division by zero")
+    if spec.seed == HANGS:
+        time.sleep(600)
+
+
+def count(
+    spec: JobSpec, out: Path, subject_dir: Path | None, report: events.Report, should_stop: Callable[[], bool]
+) -> Result:
+    checkpoint = out / "checkpoint.json"
+    step, state = json.loads(checkpoint.read_text()) if checkpoint.exists() else (0, "start")
+    print("a stray print must not break the protocol")
+    report(events.Note(f"starting at step {step}"))
+    started = time.monotonic()
+    while step < spec.iterations:
+        step, state = step + 1, chain(state, step + 1)
+        misbehave(spec, out, step)
+        time.sleep(STEP_SECONDS)
+        report(events.Progress("train", step, spec.iterations, time.monotonic() - started, loss=1.0 / step))
+        if step % spec.checkpoint_every == 0 or should_stop():
+            partial = out / "checkpoint.part"
+            partial.write_text(json.dumps([step, state]))
+            partial.replace(checkpoint)
+            report(events.Checkpointed(step, str(checkpoint), state))
+        if should_stop():
+            raise errors.Interrupted("asked to stop")
+    return finish(spec, out, state, report)
+
+
+def finish(spec: JobSpec, out: Path, state: str, report: events.Report) -> Result:
+    picture = out / "preview.png"
+    picture.write_bytes(PNG)
+    report(events.Preview(spec.iterations, str(picture), "one pixel"))
+    psnr = int(state[:6], 16) / 2**20
+    (out / "final.json").write_text(json.dumps({"state": state}))
+    return Result(
+        spec=spec,
+        means={"psnr": psnr, "ssim": 0.5, "flip": None, "lpips": float("nan")},
+        scores=(Score("01", 1, {"psnr": psnr - 1, "ssim": 0.5}), Score("02", 1, {"psnr": psnr + 1, "ssim": None})),
+        protocol={"dilation": 5},
+        gaussians=7,
+        train_seconds=1.0,
+        evaluate_seconds=0.5,
+        provenance={"commit": "0" * 40, "data_sha256": "1" * 64},
+        artifacts={"final": out / "final.json", "preview": picture},
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(serve(count))
