@@ -20,8 +20,8 @@ from typing import Any
 
 import httpx
 from rich.console import Console
-from rich.markdown import Markdown
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
 
 from services.errors import ServiceError
 from services.settings import Settings
@@ -30,6 +30,7 @@ from services.up import Stack, raise_interrupt, running
 METHODS = ("gauhuman", "mad-avatar", "rs-avatar")
 LOOK_SECONDS = 0.3
 LOG_LINES = 20
+HIDDEN = frozenset({"paper_psnr", "paper_ssim", "paper_lpips", "subjects", "seeds", "iterations"})
 COLUMNS = (
     TextColumn("{task.description:<12}"),
     BarColumn(),
@@ -134,13 +135,36 @@ def explain(stack: Stack, views: dict[str, dict[str, Any]], console: Console) ->
     return not failed
 
 
+def print_table(main: dict[str, Any], console: Console) -> None:
+    """The main table without the columns in which it has no number."""
+    shown = [
+        c for c in main["columns"] if c["key"] not in HIDDEN and any(row[c["key"]] is not None for row in main["rows"])
+    ]
+    table = Table()
+    for column in shown:
+        table.add_column(column["title"], justify="left" if column["key"] == "method" else "right")
+    for row in main["rows"]:
+        table.add_row(*(text_of(row[column["key"]]) for column in shown))
+    console.print(table)
+    for note in main["notes"]:
+        console.print(note, style="dim", highlight=False)
+
+
+def text_of(value: str | float | None) -> str:
+    """A value of the table's JSON, short."""
+    return f"{value:.3f}".rstrip("0").rstrip(".") if isinstance(value, float) else "–" if value is None else str(value)
+
+
 def demonstrate(options: argparse.Namespace, settings: Settings, console: Console) -> bool:
     """Run the jobs and print the table; whether all succeeded."""
-    with running(settings, console.print) as stack, httpx.Client(base_url=settings.url, timeout=30.0) as client:
+    with (
+        running(settings, console.print) as stack,
+        httpx.Client(base_url=settings.url, timeout=30.0, trust_env=False) as client,
+    ):
         console.print(f"service ready at {settings.url}, home {settings.home}", highlight=False)
         jobs = {submit(client, options, method): method for method in options.methods}
         succeeded = explain(stack, watch(stack, client, jobs, console), console)
-        console.print(Markdown(client.get("/api/v1/tables/main.md", params={"preset": options.preset}).text))
+        print_table(client.get("/api/v1/tables/main.json", params={"preset": options.preset}).json(), console)
         return succeeded
 
 

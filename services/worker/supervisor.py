@@ -197,6 +197,6 @@ def child_environment(settings: Settings) -> dict[str, str]:
     """Environment of a job. OpenMP and BLAS read theirs once, when the process starts, so it is set here."""
     threads = str(settings.threads)
     env = {key: value for key, value in os.environ.items() if key not in SECRETS}
-    counts = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+    counts = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RSAVATAR_THREADS")
     env |= dict.fromkeys(counts, threads)
     return env | {"OMP_WAIT_POLICY": "passive", "MALLOC_ARENA_MAX": "2", "PYTHONUNBUFFERED": "1"}
