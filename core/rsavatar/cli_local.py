@@ -11,18 +11,19 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-from rsavatar.errors import Interrupted, SpecError
+from rsavatar.errors import DataError, Interrupted, SpecError, expected
 
 
 def run(arguments: argparse.Namespace) -> int:
     """``rsavatar run``: one job, to the end or to the next Ctrl-C."""
-    from rsavatar import experiment
-    from rsavatar.cli_progress import Display, print_means
     from rsavatar.cli_request import read_request
-    from rsavatar.events import to_json
     from rsavatar.spec import resolve
 
     spec = resolve(read_request(arguments.spec, arguments.set, arguments.subject_dir))
+    from rsavatar import experiment  # seconds to import: after the mistakes that can be told without it
+    from rsavatar.cli_progress import Display, print_means
+    from rsavatar.events import to_json
+
     out: Path = arguments.out or Path("runs") / f"{spec.subject}-{spec.method}-{spec.sha256()[:8]}"
     try:
         with stop_on_signal() as stop, Display() as display:
@@ -53,6 +54,8 @@ def bench(arguments: argparse.Namespace) -> int:
 
 def check(arguments: argparse.Namespace) -> int:
     """``rsavatar data check``: the findings, and status 1 where an error is among them."""
+    if not arguments.directory.is_dir():
+        raise DataError(expected("DIR", "a folder", repr(str(arguments.directory))))
     from rsavatar.data import check as checking
 
     report = checking.check(arguments.directory, arguments.body)
