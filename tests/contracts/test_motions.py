@@ -31,7 +31,7 @@ def motion(request: pytest.FixtureRequest) -> AbstractMotion:
         poses=0.3 * random.normal(size=(FRAMES, 72)),
         Rh=random.normal(size=(FRAMES, 3)),
         Th=random.normal(size=(FRAMES, 3)),
-        mid_frames=5 + PERIOD * np.arange(FRAMES),
+        mid_frames=np.arange(5.0, 5 + PERIOD * FRAMES, PERIOD),
         period_frames=PERIOD,
         readout_frames=PERIOD,
     )

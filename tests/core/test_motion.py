@@ -24,7 +24,7 @@ def initial(frames: int = 6, seed: int = 0, readout: float = PERIOD, scale: floa
         poses=scale * random.normal(size=(frames, 72)),
         Rh=random.normal(size=(frames, 3)),
         Th=random.normal(size=(frames, 3)),
-        mid_frames=5 + PERIOD * np.arange(frames),
+        mid_frames=np.arange(5.0, 5 + PERIOD * frames, PERIOD),
         period_frames=PERIOD,
         readout_frames=readout,
     )
