@@ -205,3 +205,19 @@ def test_sample_subjects_are_sound(name: str) -> None:
         pytest.skip(f"no sample subject {SHARED / 'subjects' / name}, or no body {body}")
     report = check(SHARED / "subjects" / name, str(body))
     assert told(report) == [], render(report)
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize(("name", "shift", "what"), [("wave", 1, "one too high"), ("walk", -1, "one too low")])
+def test_sample_subjects_with_fits_off_by_one(tmp_path: Path, name: str, shift: int, what: str) -> None:
+    """On noisy fits that are biased by the shutter, too: the pictures are linked, the fits renumbered."""
+    given, body = SHARED / "subjects" / name, SHARED / "body" / "body_smpl.npz"
+    if not given.is_dir() or not body.is_file():
+        pytest.skip(f"no sample subject {given}, or no body {body}")
+    fits = tmp_path / "rs" / "new_params"
+    fits.mkdir(parents=True)
+    for path in ("meta.json", "rs/annots.npy", "rs/images", "rs/mask", "rs/gt", "rs/gt_mask"):
+        (tmp_path / path).symlink_to(given / path)
+    for n in range(24):
+        shutil.copy(given / f"rs/new_params/{(n - shift) % 24}.npy", fits / f"{n}.npy")
+    assert f"fits are numbered {what}" in told(check(tmp_path, str(body)))

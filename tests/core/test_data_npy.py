@@ -42,6 +42,20 @@ def test_containers_of_arrays_come_back(tmp_path: Path, protocol: int) -> None:
     assert got["o"]["x"].dtype == np.float32
 
 
+def test_files_of_old_numpy_are_read_without_a_warning(tmp_path: Path) -> None:
+    """Up to numpy 1.x the module was numpy.core, and dtypes were pickled with 0 and 1 for False and True."""
+    content = pickle.dumps(np.array({"Th": np.arange(3.0)}, dtype=object), protocol=2)
+    old = content.replace(b"numpy._core.multiarray\n", b"numpy.core.multiarray\n").replace(
+        b"\x89\x88\x87", b"K\0K\1\x87"
+    )
+    assert old.count(b"numpy.core") == 1
+    assert old.count(b"K\0K\1\x87") == 2
+    with (tmp_path / "a.npy").open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, {"descr": "|O", "fortran_order": False, "shape": ()})
+        file.write(old)
+    assert np.array_equal(load_plain(tmp_path / "a.npy")["Th"], [0, 1, 2])
+
+
 def test_plain_arrays_come_back(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.arange(6.0).reshape(2, 3))
     assert np.array_equal(load_plain(tmp_path / "a.npy"), np.arange(6.0).reshape(2, 3))

@@ -29,7 +29,7 @@ from rsavatar.errors import BodyError, DataError
 
 __all__ = ["Finding", "Report", "check", "render"]
 
-_SAMPLED_FRAMES = 4
+_SAMPLED_FRAMES = 6
 _SAMPLED_CAMERAS = 4
 _GOOD_IOU, _POOR_IOU = 0.6, 0.4  # clothed people overlap a naked body's silhouette by 0.7 to 0.8
 _GOOD_INSIDE, _POOR_INSIDE = 0.9, 0.7
@@ -84,7 +84,9 @@ def _check_absent(root: Path, layout: str, subject: Subject) -> list[Finding]:
     absent = sorted(calibrated - set(subject.cameras) - {"03"})
     if absent:
         hint = "they are left out"
-        findings.append(Finding("warning", "cameras", "a folder for each calibrated camera", f"no {absent}", hint))
+        findings.append(
+            Finding("warning", "cameras", "folders of all calibrated cameras", f"none for {', '.join(absent)}", hint)
+        )
     if fit_folder(root).name == "params":
         hint = "fitted without pose blend shapes in ZJU-MoCap's original release: new_params is better"
         findings.append(Finding("warning", "fits", "new_params or smpl_params", "params", hint))
@@ -99,12 +101,14 @@ def _sample(subject: Subject) -> list[Pair]:
 
 
 def _lively(fit: BodyFit) -> list[int]:
+    """The frame of largest motion in each of a few equal stretches: errors of a fit are alike in close frames."""
     n = len(fit.poses)
     if n <= _SAMPLED_FRAMES:
         return list(range(n))
     steps = 10 * np.linalg.norm(np.diff(fit.Th, axis=0), axis=1) + np.abs(np.diff(fit.poses, axis=0)).sum(1)
     inner = steps[1:] + steps[:-1]  # of frames 1 .. n-2: fits of both neighbours exist
-    return sorted(int(i) + 1 for i in np.argsort(-inner, kind="stable")[:_SAMPLED_FRAMES])
+    stretches = np.array_split(np.arange(1, n - 1), min(_SAMPLED_FRAMES, n - 2))
+    return [int(stretch[np.argmax(inner[stretch - 1])]) for stretch in stretches]
 
 
 def _lenses(root: Path, layout: str) -> dict[str, Lens]:

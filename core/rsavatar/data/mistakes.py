@@ -20,6 +20,8 @@ from rsavatar.data.images import Lens
 from rsavatar.data.silhouettes import Score, Target, score, target_of
 from rsavatar.geometry.cameras import Camera
 
+# Off-by-one fits of the four sample subjects cost 0.016 to 0.125; the same test on sound ones gives at most 0.003.
+_OFFSET_MARGIN = 0.012
 COARSE = 0.1  # what a gross mistake costs at least; one that costs less is subtle
 
 
@@ -101,8 +103,8 @@ MISTAKES = (
         "images were resized, K was not: scale its first two rows with the images",
         camera=_centred,
     ),
-    Mistake("fits are numbered one too high", "fit n + 1 belongs to image n", offset=1, margin=0.012),
-    Mistake("fits are numbered one too low", "fit n - 1 belongs to image n", offset=-1, margin=0.012),
+    Mistake("fits are numbered one too high", "fit n + 1 belongs to image n", offset=1, margin=_OFFSET_MARGIN),
+    Mistake("fits are numbered one too low", "fit n - 1 belongs to image n", offset=-1, margin=_OFFSET_MARGIN),
     Mistake(
         "fits were made without pose blend shapes",
         "ZJU-MoCap's `params` were, its `new_params` were not: use new_params, or fit again",
@@ -181,15 +183,26 @@ class Diagnosis:
 
 
 def diagnose(trial: Trial, given: Mapping[Pair, Score], subtle_only: bool) -> list[Diagnosis]:
-    """Mistakes whose undoing betters the overlap by more than their margin, the likeliest first."""
+    """Mistakes whose undoing betters the overlap by more than their margin and in most frames, the likeliest first.
+
+    Errors of a fit favour one change in one frame and another in the next; a mistake favours its undoing in all.
+    """
     found = []
     for mistake in MISTAKES:
         if trial.applicable(mistake) and (mistake.subtle or not subtle_only):
             undone = trial.scores(mistake)
             diagnosis = Diagnosis(mistake, mean_iou(given, list(undone)), mean_iou(undone))
-            if diagnosis.after > diagnosis.before + mistake.margin:
+            if diagnosis.after > diagnosis.before + mistake.margin and _is_steady(given, undone):
                 found.append(diagnosis)
     return sorted(found, key=lambda each: each.before - each.after)
+
+
+def _is_steady(given: Mapping[Pair, Score], undone: Mapping[Pair, Score]) -> bool:
+    """True when at most one frame in three gets worse."""
+    frames = sorted({index for _, index in undone})
+    pairs = [[pair for pair in undone if pair[1] == index] for index in frames]
+    worse = sum(mean_iou(undone, each) <= mean_iou(given, each) for each in pairs)
+    return worse * 3 <= len(frames)
 
 
 def _state(fit: BodyFit, index: int) -> BodyFit:
