@@ -20,10 +20,14 @@ from setuptools.command.build_py import build_py
 ROOT = Path(__file__).parent
 SOURCES = sorted((ROOT / "core/native").glob("*.cpp"))
 X86 = platform.machine() in ("x86_64", "AMD64")
-TARGETS = {"avx2": ["-march=x86-64-v3"], "avx512": ["-march=x86-64-v4", "-mprefer-vector-width=512"]} if X86 else {"generic": []}
+TARGETS = (
+    {"avx2": ["-march=x86-64-v3"], "avx512": ["-march=x86-64-v4", "-mprefer-vector-width=512"]}
+    if X86
+    else {"generic": []}
+)
 # No -ffast-math: it folds away the rounding trick in exp2, and sets flush-to-zero for the whole process.
-FLAGS = "-std=c++17 -O3 -fno-math-errno -fno-trapping-math -fno-signed-zeros -ffp-contract=fast -fopenmp -fPIC".split()
-FLAGS += "-fvisibility=hidden -Wall -Wextra -Wno-psabi".split()
+FLAGS = ["-std=c++17", "-O3", "-fopenmp", "-fPIC", "-fvisibility=hidden", "-Wall", "-Wextra", "-Wno-psabi"]
+FLAGS += ["-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-ffp-contract=fast"]
 
 NO_COMPILER = """
 C++ compiler: expected g++ or clang++ on PATH (or CXX set), got none.
@@ -56,6 +60,7 @@ class BuildKernels(build_ext):
         return Path(self.build_lib) / "rsavatar/render"
 
     def build_extension(self, ext: Extension) -> None:
+        """Compile every source for every target, side by side, and link."""
         if os.environ.get("RSAVATAR_NATIVE") == "0":
             return
         cxx, temp = compiler(), Path(self.build_temp)
@@ -71,6 +76,7 @@ class BuildKernels(build_ext):
             run([cxx, "-shared", "-fopenmp", *objects, "-o", str(self.folder / f"_kernels_{target}.so")])
 
     def get_ext_filename(self, fullname: str) -> str:
+        """The first target's library stands for the extension."""
         return f"rsavatar/render/_kernels_{next(iter(TARGETS))}.so"
 
     def copy_extensions_to_source(self) -> None:
@@ -83,9 +89,12 @@ class BuildPackage(build_py):
     """Takes the preset files, which live beside the package, into it."""
 
     def run(self) -> None:
+        """As usual, then the presets."""
         super().run()
         if not self.editable_mode:
-            shutil.copytree(ROOT / "core/experiments", Path(self.build_lib) / "rsavatar/experiments", dirs_exist_ok=True)
+            shutil.copytree(
+                ROOT / "core/experiments", Path(self.build_lib) / "rsavatar/experiments", dirs_exist_ok=True
+            )
 
 
 setup(

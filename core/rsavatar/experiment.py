@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import json
+import os
+import platform
+import subprocess
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rsavatar.events import Report, silent
+import torch
+
+from rsavatar import __version__, catalog
+from rsavatar.body.find import find_body
+from rsavatar.checkpoint import Owner, read_own
+from rsavatar.data.catalogue import open_subject
+from rsavatar.errors import CheckpointError
+from rsavatar.evaluate import Score, evaluate
+from rsavatar.events import Note, Report, silent
+from rsavatar.methods.base import AbstractMethod, Case, build_actor, check_case, observations, settings
+from rsavatar.optimization import Saver
+from rsavatar.render import native
 from rsavatar.spec import JobSpec
-
-
-@dataclass(frozen=True)
-class Score:
-    """Metrics of one held-out image; a metric that could not be computed is None (protocol says why)."""
-
-    camera: str
-    frame: int
-    values: Mapping[str, float | None]
+from rsavatar.train import fit
 
 
 @dataclass(frozen=True)
@@ -65,14 +72,87 @@ def run(
     report: Report = silent,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Result:
-    """Load the subject, train, evaluate, and write ``OUT/{checkpoint.safetensors, metrics.json, motion.npz, predictions}``.
+    """Load the subject, train, evaluate; ``out`` gets checkpoint.safetensors, metrics.json, motion.npz, predictions/.
 
-    Resumes from ``OUT/checkpoint.safetensors`` where that is of the same spec, data and code; the result is bit-identical
-    to that of an undisturbed run. ``subject_dir`` None means a subject that the core makes itself (``studio``).
+    Resumes from the checkpoint there if it is of the same spec, data and code; the result is bit-identical to that of
+    an undisturbed run. ``subject_dir`` None means a subject that the core makes itself (``studio``).
     ``should_stop`` is asked once a step: when true, a checkpoint is written and ``Interrupted`` raised.
 
     Raises:
         DataError, BodyError, CheckpointError, KernelError, DivergedError: as their names say.
         Interrupted: when ``should_stop`` asked for it.
     """
-    raise NotImplementedError
+    _use_threads()
+    out = out.resolve()
+    out.mkdir(parents=True, exist_ok=True)
+    subject = open_subject(spec.subject, subject_dir)
+    body, which = find_body(spec.body, subject)
+    report(Note(which))
+    if not native.available():
+        report(Note("No native kernels: rendering with the torch twin, several hundred times slower."))
+    case = Case(spec, subject, body)
+    check_case(case)
+    method: AbstractMethod = catalog.load(catalog.METHODS, spec.method)()
+    actor = build_actor(method, case)
+    owner = Owner(spec.sha256(), subject.fingerprint, body.sha256, __version__)
+    saver = Saver(_checkpoint_file(out, owner, report), owner)
+    trained = fit(actor, observations(method, case), settings(case), saver, report, should_stop)
+    scored = evaluate(actor, subject, spec.sh_degree, out, report)
+    metrics = out / "metrics.json"
+    result = Result(
+        spec=spec,
+        means=scored.means,
+        scores=scored.scores,
+        protocol=scored.protocol,
+        gaussians=actor.avatar.count,
+        train_seconds=trained.seconds,
+        evaluate_seconds=scored.seconds,
+        provenance=_provenance(owner, trained.rejected),
+        artifacts={"checkpoint": trained.checkpoint, "metrics": metrics, "motion": out / "motion.npz"},
+    )
+    metrics.write_text(json.dumps(result.to_json(), indent=1) + "\n")
+    return result
+
+
+def _use_threads() -> None:
+    """RSAVATAR_THREADS, or all cores that this process may use; the result does not depend on it."""
+    torch.set_num_threads(int(os.environ.get("RSAVATAR_THREADS", len(os.sched_getaffinity(0)))))
+
+
+def _checkpoint_file(out: Path, owner: Owner, report: Report) -> Path:
+    """Where the checkpoint is or will be. One that belongs to another job is set aside, not overwritten."""
+    path = out / "checkpoint.safetensors"
+    if path.exists():
+        try:
+            _, step = read_own(path, owner)
+            report(Note(f"Resuming from step {step}."))
+        except CheckpointError as error:
+            aside = path.with_suffix(".other.safetensors")
+            path.replace(aside)
+            report(Note(f"Starting anew, old checkpoint kept as {aside.name}: {error}"))
+    return path
+
+
+def _provenance(owner: Owner, rejected: int) -> dict[str, Any]:
+    """What produced the numbers."""
+    return {
+        "version": __version__,
+        "commit": commit(),
+        "spec_sha256": owner.spec,
+        "data_sha256": owner.data,
+        "body_sha256": owner.body,
+        "torch": torch.__version__,
+        "kernels": native.targets()[0] if native.available() else "torch twin",
+        "threads": torch.get_num_threads(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, {platform.system()}",
+        "rejected_steps": rejected,
+    }
+
+
+def commit() -> str:
+    """Commit of the checkout that this package runs from; "unknown" outside of one."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short=12", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"

@@ -1,0 +1,150 @@
+"""What a method decides, and how the rest of a job is put together around it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from rsavatar.avatar.avatar import Avatar
+from rsavatar.avatar.density import DensityRules
+from rsavatar.avatar.networks import PoseResidual, SkinOffset
+from rsavatar.avatar.surface import Surface
+from rsavatar.body.base import BodyModel
+from rsavatar.data.base import Bytes, Subject
+from rsavatar.errors import DataError, SpecError, expected
+from rsavatar.imaging import Actor, plan
+from rsavatar.motion.base import AbstractMotion, InitialMotion
+from rsavatar.optimization import Settings
+from rsavatar.shutter.base import AbstractShutter
+from rsavatar.spec import JobSpec
+from rsavatar.train import Observation
+
+MARGIN = 0.12  # of the mask's box, on each side: room for the initial fit's error and the motion
+
+
+@dataclass(frozen=True)
+class Case:
+    """A job's inputs."""
+
+    spec: JobSpec
+    subject: Subject
+    body: BodyModel
+
+    @property
+    def bands(self) -> int:
+        """T as a number: what the paper's discretisations count; K where rows are continuous."""
+        period = round(self.subject.timing.period_frames)
+        bands = self.spec.bands(period)
+        return period if bands == "scanline" else bands
+
+    def initial_motion(self) -> InitialMotion:
+        """The per-frame fit and the frames' clock."""
+        fit, timing = self.subject.fit, self.subject.timing
+        return InitialMotion(fit.poses, fit.Rh, fit.Th, timing.mid_frames, timing.period_frames, timing.readout_frames)
+
+
+class AbstractMethod(ABC):
+    """A motion model and an image formation model.
+
+    **Contract**: both are functions of the case alone; every method gets the same Gaussians, losses, optimiser and
+    number of steps.
+    """
+
+    @abstractmethod
+    def motion(self, case: Case) -> AbstractMotion:
+        """Pose as a function of time."""
+
+    @abstractmethod
+    def shutter(self, case: Case) -> AbstractShutter:
+        """How a training frame is exposed, as this method believes."""
+
+
+def check_case(case: Case) -> None:
+    """Refuse a spec that contradicts its subject.
+
+    Raises:
+        SpecError: if K is not the subject's.
+        DataError: if there is nothing to train on.
+    """
+    period = case.subject.timing.period_frames
+    if case.spec.K is not None and period != case.spec.K:
+        raise SpecError(expected("K", f"{period:g}, which subject {case.subject.name} was built with", case.spec.K))
+    if not case.subject.training or not case.subject.frames:
+        raise DataError(expected(f"subject {case.subject.name}", "training cameras and frames", "none"))
+
+
+def build_actor(method: AbstractMethod, case: Case) -> Actor:
+    """The avatar at its start: Gaussians on the body's vertices, moving as the initial fit says."""
+    torch.manual_seed(case.spec.seed)  # the networks' initial weights
+    fit, lost = case.subject.fit, case.spec.ablation
+    surface = Surface(case.body, fit.shapes)
+    return Actor(
+        Avatar(surface),
+        method.motion(case),
+        surface.pose_offsets(fit.poses),
+        None if lost.no_pose_deformation else PoseResidual(),
+        None if lost.no_lbs_refinement else SkinOffset(),
+    )
+
+
+def observations(method: AbstractMethod, case: Case) -> list[Observation]:
+    """Every training image, decoded once, cut to its body, with its schedule planned.
+
+    Raises:
+        DataError: if an image cannot be read or every mask is empty.
+    """
+    subject, shutter = case.subject, method.shutter(case)
+    found = []
+    for name in subject.training:
+        camera, trigger = subject.cameras[name], subject.timing.trigger(name)
+        slots = shutter.slots(camera.height, subject.timing.readout_frames, trigger)
+        for frame in range(subject.frames):
+            rgb, mask = subject.observe(name, frame)
+            box = body_box(mask)
+            if box is None:  # nobody in the picture: nothing to learn from it
+                continue
+            x0, y0, x1, y1 = box
+            pixels = torch.from_numpy(np.ascontiguousarray(rgb[y0:y1, x0:x1]))
+            coverage = torch.from_numpy(np.ascontiguousarray(mask[y0:y1, x0:x1]))
+            schedule = plan(slots, y0, y1)
+            cut = camera.cropped(x0, y0, x1, y1)
+            found.append(Observation(frame, cut, schedule, pixels, coverage, (camera.height, camera.width)))
+    if not found:
+        raise DataError(expected(f"subject {subject.name}", "a training image with a body in its mask", "none"))
+    return found
+
+
+def body_box(mask: Bytes) -> tuple[int, int, int, int] | None:
+    """Columns and rows (x0, y0, x1, y1) of the mask with a margin, within the image; None for an empty mask."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if not len(rows):
+        return None
+    height, width = mask.shape
+    margin = 8 + round(MARGIN * max(rows[-1] - rows[0], columns[-1] - columns[0]))
+    return (
+        max(int(columns[0]) - margin, 0),
+        max(int(rows[0]) - margin, 0),
+        min(int(columns[-1]) + 1 + margin, width),
+        min(int(rows[-1]) + 1 + margin, height),
+    )
+
+
+def settings(case: Case) -> Settings:
+    """How to train: the spec's words in the trainer's."""
+    spec = case.spec
+    centres = np.stack([case.subject.cameras[name].centre for name in case.subject.training])
+    spread = float(np.linalg.norm(centres - centres.mean(0), axis=1).max())
+    return Settings(
+        iterations=spec.iterations,
+        seed=spec.seed,
+        extent=1.1 * spread if len(centres) > 1 else 1.0,
+        lambda_reg=0.0 if spec.ablation.no_reg else spec.lambda_reg,
+        continuity=spec.continuity,
+        mask_weight=spec.mask_weight,
+        sh_degree=spec.sh_degree,
+        checkpoint_every=spec.checkpoint_every,
+        density=DensityRules() if spec.densify else None,
+    )

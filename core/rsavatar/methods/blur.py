@@ -1,0 +1,25 @@
+"""MAD-Avatar's operator on rolling-shutter frames: the same spline, the same T renders, averaged (paper, eq. blur)."""
+
+from __future__ import annotations
+
+from rsavatar.methods.base import AbstractMethod, Case
+from rsavatar.motion.base import AbstractMotion
+from rsavatar.motion.spline import FrameSpline
+from rsavatar.motion.still import StillPose
+from rsavatar.shutter.base import AbstractShutter
+from rsavatar.shutter.rolling import Blur
+
+
+class BlurAvatar(AbstractMethod):
+    """Differs from the paper's rolling-shutter model in the operator alone."""
+
+    def motion(self, case: Case) -> AbstractMotion:
+        """The same as ``RollingShutterAvatar``'s."""
+        spec = case.spec
+        if spec.ablation.no_spline:
+            return StillPose(case.initial_motion())
+        return FrameSpline(case.initial_motion(), case.bands, spec.P, spec.perturbation, spec.seed)
+
+    def shutter(self, case: Case) -> AbstractShutter:
+        """The mean of T instants over the readout."""
+        return Blur(case.bands)

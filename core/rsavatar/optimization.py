@@ -1,0 +1,218 @@
+"""What training holds besides the actor: Adam's moments, running gradients, the step; and its checkpoints."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from rsavatar import checkpoint
+from rsavatar.avatar.density import DensityRules, Edit, ScreenGradients
+from rsavatar.errors import DivergedError, expected
+from rsavatar.events import Checkpointed
+from rsavatar.imaging import Actor
+from rsavatar.motion.base import Continuity
+
+BLOCK = 50  # steps between refreshes of the skinning weights; all that saves state happens between blocks
+MOST_REJECTED = 50  # rejected steps in a row before training is called diverged
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Adam's step sizes: GauHuman's for the Gaussians, MAD-Avatar's for the motion."""
+
+    means: float = 1.6e-4  # times the extent; falls to 1/100 of itself, log-linearly
+    colours: float = 2.5e-3
+    colours_linear: float = 1.25e-4
+    opacities: float = 0.05
+    scales: float = 5e-3
+    rotations: float = 1e-3
+    motion: float = 1e-3  # control points and shape; falls to 1/100 of itself, log-linearly
+    pose_residual: float = 5e-5
+    skin_offset: float = 5e-4  # one step a block, on the sum of its gradients
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How long and how to train."""
+
+    iterations: int
+    seed: int
+    extent: float  # metres: 1.1 times the largest distance of a camera from their centre
+    lambda_reg: float
+    continuity: Continuity
+    mask_weight: float
+    sh_degree: int
+    checkpoint_every: int
+    density: DensityRules | None
+    rates: Rates = field(default_factory=Rates)
+    sh_from: int = 1000  # step at which the colours' linear harmonics start
+
+    def degree(self, step: int) -> int:
+        """Degree of the colours' harmonics at ``step``."""
+        return self.sh_degree if step >= self.sh_from else 0
+
+    def closes_block(self, step: int) -> bool:
+        """Whether a block of steps ends at ``step`` (counted from 1)."""
+        return step % BLOCK == 0
+
+
+class SkinBlock:
+    """Skinning weights of one block of steps: computed once, their gradient summed, one network step at the end.
+
+    The offset network sees canonical positions only, and those hardly move within a block.
+    """
+
+    def __init__(self, actor: Actor) -> None:
+        self._refined = actor.skin_weights()
+        self.weights = self._refined.detach().requires_grad_(self._refined.requires_grad)
+
+    def close(self, optimizer: torch.optim.Optimizer) -> None:
+        """Hand the summed gradient to the network and take its step; non-finite sums are dropped."""
+        gradient = self.weights.grad
+        if gradient is None or not math.isfinite(float(gradient.sum())):
+            return
+        torch.autograd.backward(self._refined, gradient)
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
+
+
+class State:
+    """Everything that changes from step to step, besides the actor's own parameters."""
+
+    def __init__(self, actor: Actor, settings: Settings) -> None:
+        rates, a = settings.rates, actor.avatar
+        motion = [*actor.motion.parameters(), actor.shapes]
+        groups: list[tuple[str, list[torch.nn.Parameter], float]] = [
+            ("means", [a.means], rates.means * settings.extent),
+            ("sh_constant", [a.sh_constant], rates.colours),
+            ("sh_linear", [a.sh_linear], rates.colours_linear),
+            ("opacity_logits", [a.opacity_logits], rates.opacities),
+            ("log_scales", [a.log_scales], rates.scales),
+            ("rotations", [a.rotations], rates.rotations),
+            ("motion", motion, rates.motion),
+            (
+                "pose_residual",
+                list(actor.pose_residual.parameters()) if actor.pose_residual else [],
+                rates.pose_residual,
+            ),
+        ]
+        adam = [{"name": name, "params": params, "lr": lr, "initial": lr} for name, params, lr in groups if params]
+        self.optimizer = torch.optim.Adam(adam, eps=1e-15, fused=True)
+        skin = list(actor.skin_offset.parameters()) if actor.skin_offset else [torch.nn.Parameter(torch.zeros(0))]
+        self.skin_optimizer = torch.optim.Adam(skin, lr=rates.skin_offset, fused=True)
+        self.gradients = ScreenGradients(actor.avatar.count)
+        self.step = 0
+        self.rejected = 0
+        self.rejected_in_a_row = 0
+        self.seconds = 0.0
+
+    def advance(self, actor: Actor, screen: Tensor, loss: Tensor, size: tuple[int, int]) -> None:
+        """Take the optimiser's step on the gradients at hand, or reject them where they are not finite.
+
+        Raises:
+            DivergedError: after ``MOST_REJECTED`` rejections in a row.
+        """
+        if _finite(loss, screen, actor):
+            self.optimizer.step()
+            self.gradients.add(_grad(screen), *size)
+            self.rejected_in_a_row = 0
+        else:
+            self.rejected, self.rejected_in_a_row = self.rejected + 1, self.rejected_in_a_row + 1
+            if self.rejected_in_a_row >= MOST_REJECTED:
+                got = f"{MOST_REJECTED} steps in a row without: diverged"
+                raise DivergedError(expected(f"step {self.step}", "a finite loss and gradient", got))
+        self.optimizer.zero_grad(set_to_none=True)
+        self.step += 1
+
+    def set_rates(self, settings: Settings) -> None:
+        """Means and motion fall to a hundredth of their first rate, log-linearly over the run."""
+        decay = 0.01 ** (self.step / settings.iterations)
+        for group in self.optimizer.param_groups:
+            if group["name"] in ("means", "motion"):
+                group["lr"] = group["initial"] * decay
+
+    def edit(self, actor: Actor, edit: Edit) -> None:
+        """Apply a density edit to the Gaussians, Adam's moments and the running gradients."""
+        for group in self.optimizer.param_groups:
+            if group["name"] not in edit.added:
+                continue
+            added = edit.added[group["name"]]
+            old = group["params"][0]
+            new = torch.nn.Parameter(torch.cat([old.detach()[..., edit.keep], added], -1))
+            moments = self.optimizer.state.pop(old, {})
+            for key in ("exp_avg", "exp_avg_sq"):
+                if key in moments:
+                    moments[key] = torch.cat([moments[key][..., edit.keep], torch.zeros_like(added)], -1)
+            if moments:
+                self.optimizer.state[new] = moments
+            group["params"][0] = new
+            setattr(actor.avatar, group["name"], new)
+        self.gradients = ScreenGradients(actor.avatar.count)
+
+
+def _grad(tensor: Tensor) -> Tensor:
+    return tensor.grad if tensor.grad is not None else torch.zeros_like(tensor)
+
+
+def _finite(loss: Tensor, screen: Tensor, actor: Actor) -> bool:
+    """Whether the loss and the gradients that everything flows through are finite."""
+    watched = [screen, actor.avatar.means, actor.avatar.log_scales, actor.shapes, *actor.motion.parameters()]
+    return math.isfinite(float(loss)) and all(math.isfinite(float(_grad(t).sum())) for t in watched)
+
+
+class Saver:
+    """Checkpoints of one training run: a file, and who it belongs to."""
+
+    def __init__(self, path: Path, owner: checkpoint.Owner) -> None:
+        self.path = path
+        self.owner = owner
+
+    def due(self, step: int, settings: Settings) -> bool:
+        """Whether the end of the block that ends at ``step`` is one to save: every so many steps, and the last."""
+        every = -(-settings.checkpoint_every // BLOCK) * BLOCK
+        return step % every == 0 or step == settings.iterations
+
+    def save(self, actor: Actor, state: State) -> Checkpointed:
+        """Write everything that the next step depends on."""
+        tensors = {f"actor.{name}": t for name, t in actor.state_dict().items()}
+        for prefix, optimizer in (("adam", state.optimizer), ("skin_adam", state.skin_optimizer)):
+            for i, moments in optimizer.state_dict()["state"].items():
+                tensors |= {f"{prefix}.{i}.{key}": value for key, value in moments.items()}
+        tensors |= {"gradients.total": state.gradients.total, "gradients.seen": state.gradients.seen}
+        tensors["progress"] = torch.tensor([state.rejected, state.seconds], dtype=torch.float64)
+        return Checkpointed(state.step, str(self.path), checkpoint.write(self.path, tensors, self.owner, state.step))
+
+    def restore(self, actor: Actor, settings: Settings) -> State:
+        """The state to go on from: the checkpoint's, or a new one where there is none.
+
+        Raises:
+            CheckpointError: if there is one that is damaged or belongs to another job.
+        """
+        if not self.path.exists():
+            return State(actor, settings)
+        tensors, step = checkpoint.read_own(self.path, self.owner)
+        load_actor(actor, tensors)
+        state = State(actor, settings)
+        for prefix, optimizer in (("adam", state.optimizer), ("skin_adam", state.skin_optimizer)):
+            saved = optimizer.state_dict()
+            for name, value in tensors.items():
+                if name.startswith(prefix + "."):
+                    _, i, key = name.split(".")
+                    saved["state"].setdefault(int(i), {})[key] = value
+            optimizer.load_state_dict(saved)
+        state.gradients.total, state.gradients.seen = tensors["gradients.total"], tensors["gradients.seen"]
+        state.rejected, state.seconds = int(tensors["progress"][0]), float(tensors["progress"][1])
+        state.step = step
+        return state
+
+
+def load_actor(actor: Actor, tensors: dict[str, Tensor]) -> None:
+    """Put a checkpoint's Gaussians, motion and networks into ``actor``, whatever their number."""
+    for name, parameter in actor.named_parameters():
+        parameter.data = tensors[f"actor.{name}"]
+    for name in ("vertex", "prior"):
+        setattr(actor.avatar, name, tensors[f"actor.avatar.{name}"])

@@ -1,0 +1,121 @@
+"""Training: one visible loop that knows neither which motion nor which shutter it holds (paper, section 3.4)."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from rsavatar.avatar.density import DensityRules, decide, prune
+from rsavatar.errors import Interrupted
+from rsavatar.events import Note, Progress, Report
+from rsavatar.geometry.cameras import Camera
+from rsavatar.imaging import Actor, Schedule, expose
+from rsavatar.losses import l1
+from rsavatar.optimization import Saver, Settings, SkinBlock, State
+from rsavatar.render.base import Rendering
+
+REPORT_EVERY = 25  # steps
+
+
+@dataclass(frozen=True)
+class Observation:
+    """A training image, cut to its body: bytes, mask, and how its rows were exposed."""
+
+    frame: int
+    camera: Camera
+    schedule: Schedule
+    rgb: Tensor  # [h, w, 3] uint8
+    mask: Tensor  # [h, w] uint8 coverage
+    full_size: tuple[int, int]  # height and width of the uncut image
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What training leaves behind, besides the actor itself."""
+
+    seconds: float
+    rejected: int
+    checkpoint: Path
+
+
+def fit(
+    actor: Actor,
+    observations: Sequence[Observation],
+    settings: Settings,
+    saver: Saver,
+    report: Report,
+    should_stop: Callable[[], bool],
+) -> Trained:
+    """Minimise |image - observation| + lambda L_reg over everything that ``actor`` holds (paper, eq. loss).
+
+    One observation a step, each once an epoch in a new order. Every random choice is a function of the seed and the
+    step, so a run resumed from a checkpoint ends bit-identical to one that was never disturbed. Skinning weights are
+    refreshed, Gaussians come and go, and checkpoints are written between blocks of steps.
+
+    Raises:
+        DivergedError: if many steps in a row gave no finite loss and gradient.
+        Interrupted: if ``should_stop`` asked for it; the checkpoint is on disk.
+    """
+    state = saver.restore(actor, settings)
+    begun = time.perf_counter() - state.seconds
+    skin = SkinBlock(actor)
+    while state.step < settings.iterations:
+        seen = observations[pick(settings.seed, state.step, len(observations))]
+        state.set_rates(settings)
+
+        scene = actor.scene(seen.frame, seen.camera, seen.schedule, skin.weights, settings.degree(state.step))
+        image = expose(scene)
+        loss = l1(image, seen.rgb, seen.mask, 0.0, settings.mask_weight)
+        if settings.lambda_reg:
+            loss = loss + settings.lambda_reg * actor.motion.penalty(settings.continuity)
+        torch.autograd.backward(loss)
+
+        state.advance(actor, scene.gaussians.screen, loss.detach(), seen.full_size)
+        state.seconds = time.perf_counter() - begun
+        last = state.step == settings.iterations
+        if last or state.step % REPORT_EVERY == 0:
+            report(_progress(state, settings, float(loss.detach()), image, seen))
+        if last or settings.closes_block(state.step):
+            skin.close(state.skin_optimizer)
+            if settings.density and settings.density.due(state.step):
+                report(Note(_control_density(actor, state, settings, settings.density)))
+            stop = not last and should_stop()
+            if stop or saver.due(state.step, settings):
+                report(saver.save(actor, state))
+            if stop:
+                raise Interrupted(f"stopped at step {state.step} of {settings.iterations}; run again to go on")
+            skin = SkinBlock(actor)
+    return Trained(state.seconds, state.rejected, saver.path)
+
+
+def pick(seed: int, step: int, count: int) -> int:
+    """Which of ``count`` observations step ``step`` looks at: a new permutation each epoch, a function of both."""
+    epoch, place = divmod(step, count)
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(seed * 1_000_003 + epoch))
+    return int(order[place])
+
+
+def _control_density(actor: Actor, state: State, settings: Settings, rules: DensityRules) -> str:
+    """One round of density control, and what it did."""
+    seed = settings.seed * 1_000_003 + state.step
+    before = actor.avatar.count
+    edit, done = decide(actor.avatar, state.gradients.mean(), settings.extent, rules, seed)
+    state.edit(actor, edit)
+    grown = actor.avatar.count
+    state.edit(actor, prune(actor.avatar, actor.avatar.bind(), rules))
+    actor.avatar.bind()
+    changes = f"{done.cloned} cloned, {done.split} split, {done.merged} merged, {grown - actor.avatar.count} pruned"
+    return f"step {state.step}: {before} -> {actor.avatar.count} Gaussians ({changes})"
+
+
+def _progress(state: State, settings: Settings, loss: float, image: Rendering, seen: Observation) -> Progress:
+    error = image.rgb.detach() - seen.rgb.permute(2, 0, 1) / 255
+    psnr = -10 * math.log10(max(float(error.square().mean()), 1e-12))
+    count = len(state.gradients.total)
+    return Progress("train", state.step, settings.iterations, state.seconds, loss, psnr, count)
