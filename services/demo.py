@@ -128,7 +128,7 @@ def explain(stack: Stack, views: dict[str, dict[str, Any]], console: Console) ->
         error = view["error"] or {"kind": view["state"], "message": "no message"}
         console.print(f"[red]{view['method']}: {error['kind']}[/red]\n{error['message']}", highlight=False)
         log = stack.settings.job_dir(job) / "log.txt"
-        if log.is_file():
+        if log.is_file() and "Traceback" not in error["message"]:
             console.print(
                 "\n".join(log.read_text("utf-8", "replace").splitlines()[-20:]), highlight=False, markup=False
             )

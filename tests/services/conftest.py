@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import pytest
+import uvicorn
+
+from services import redis_server
+from services.api.app import create_app
+from services.process import stop
+from services.settings import Settings, make_home
+from services.store import jobs, schema
+from services.store.records import Job, Submission
+from services.store.session import Store
+
+SPEC = {"method": "gauhuman", "subject": "studio", "preset": "smoke", "priority": 0, "seed": 0, "iterations": 10}
+
+
+@pytest.fixture(scope="session")
+def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    settings = Settings(home=tmp_path_factory.mktemp("broker"))
+    make_home(settings)
+    process = subprocess.Popen(redis_server.command(settings), stdout=subprocess.DEVNULL)
+    redis_server.wait_until_ready(settings, 10.0)
+    yield settings.broker
+    stop(process, 5.0)
+
+
+@pytest.fixture
+def settings(tmp_path: Path, broker: str) -> Settings:
+    return Settings(home=tmp_path / "home", broker_url=broker, poll_seconds=0.02, ping_seconds=0.1, backoff_seconds=0.0)
+
+
+@pytest.fixture
+def store(settings: Settings) -> Iterator[Store]:
+    make_home(settings)
+    store = Store(settings)
+    schema.migrate(store)
+    yield store
+    store.close()
+
+
+@contextmanager
+def serving(settings: Settings) -> Iterator[httpx.Client]:
+    """The application behind a real socket, in a thread."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        config = uvicorn.Config(create_app(settings), log_level="error", timeout_graceful_shutdown=1)
+        server = uvicorn.Server(config)
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        while not server.started:
+            time.sleep(0.005)
+        url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+        with httpx.Client(base_url=url, timeout=20.0, trust_env=False) as client:
+            yield client
+        server.should_exit = True
+        thread.join()
+
+
+@pytest.fixture
+def client(settings: Settings, store: Store) -> Iterator[httpx.Client]:
+    with serving(settings) as client:
+        yield client
+
+
+def submission(spec_sha256: str = "a" * 64, key: str | None = None, request: str = "r", **spec: object) -> Submission:
+    return Submission({**SPEC, **spec}, spec_sha256, request, max_attempts=3, idempotency_key=key)
+
+
+def submit(store: Store, **spec: object) -> Job:
+    return jobs.submit(store, submission(**spec))[0]  # type: ignore[arg-type]
