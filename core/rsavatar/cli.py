@@ -53,6 +53,14 @@ metres for millimetres, Rh taken for global_orient, files that are missing. Exit
 example:
   rsavatar data check data/CoreView_377
 """
+STUDIO = """\
+A painted person with a true motion before eight cameras, every row drawn at its own instant. Jobs on the subject
+"studio" make it by themselves; this verb makes one to look at, or another one.
+
+examples:
+  rsavatar data studio data/studio
+  rsavatar data studio data/tall --seed 3 --size 256 --frames 24
+"""
 WATCH = (
     "Follows a job's progress and prints its results. A broken connection is taken up again. Ctrl-C only stops looking."
 )
@@ -110,8 +118,14 @@ def _add_local(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     check = _add(nouns, "check", "rsavatar.cli_local:check", "is a subject fit for training?", CHECK)
     check.add_argument("directory", type=Path, metavar="DIR")
     check.add_argument("--body", default="auto", help="auto, anny, or an SMPL-format .npz or .pkl (default: auto)")
-    studio = _add(nouns, "studio", "rsavatar.cli_local:studio", "make the built-in subject, without any download")
+    studio = _add(
+        nouns, "studio", "rsavatar.cli_local:studio", "make the built-in subject, without any download", STUDIO
+    )
     studio.add_argument("directory", type=Path, metavar="OUT")
+    studio.add_argument("--seed", type=int, default=0, help="motion, build and clothes (default: 0)")
+    studio.add_argument("--size", type=int, help="height and width of the pictures, pixels")
+    studio.add_argument("--frames", type=int, help="output frames")
+    studio.add_argument("--gamma", type=float, help="readout as a part of the frame period; 0 = global shutter")
 
 
 def _add_remote(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

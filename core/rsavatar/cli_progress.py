@@ -33,7 +33,7 @@ class Display:
         )
         self._bars = Progress(*columns, console=self._console, disable=not self._console.is_terminal)
         self._tasks: dict[str, TaskID] = {}
-        self._last_line = 0.0
+        self._last_line = -LINE_EVERY_S
 
     def __enter__(self) -> Self:
         self._bars.start()

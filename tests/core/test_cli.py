@@ -41,7 +41,7 @@ def test_every_verb_explains_itself(verb: str, capsys: pytest.CaptureFixture[str
     assert max(map(len, text.splitlines())) <= 120
 
 
-@pytest.mark.parametrize("verb", ["", "run", "submit", "data check"])
+@pytest.mark.parametrize("verb", ["", "run", "submit", "data check", "data studio"])
 def test_help_teaches_by_examples_that_parse(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main([*verb.split(), "--help"])
@@ -132,6 +132,14 @@ def test_a_broken_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[st
 def test_debug_shows_the_traceback() -> None:
     with pytest.raises(SpecError):
         main(["run", "nothing.toml", "--debug"])
+
+
+def test_a_studio_subject_is_made_where_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["data", "studio", str(tmp_path / "tiny"), "--size", "24", "--frames", "1", "--gamma", "0"]
+    assert main(words) == 0
+    assert capsys.readouterr().out == f"{tmp_path / 'tiny'}\n"
+    assert (tmp_path / "tiny" / "meta.json").is_file()
+    assert main([*words[:3], "--frames", "0"]) == 2
 
 
 def test_an_absent_benchmark_is_said_plainly() -> None:
