@@ -106,7 +106,7 @@ def count_by_state(store: Store) -> dict[str, int]:
     """Number of jobs in every state, zeros included."""
     with store.read() as session:
         rows = session.execute(select(JobRow.state, func.count()).group_by(JobRow.state))
-        found = dict(rows.tuples().all())
+        found = {row[0]: row[1] for row in rows}
     return {str(state): found.get(state, 0) for state in State}
 
 
