@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import shutil
 import socket
 import subprocess
 import threading
@@ -38,11 +39,21 @@ def settings(tmp_path: Path, broker: str) -> Settings:
     return Settings(home=tmp_path / "home", broker_url=broker, poll_seconds=0.02, ping_seconds=0.1, backoff_seconds=0.0)
 
 
-@pytest.fixture
-def store(settings: Settings) -> Iterator[Store]:
-    make_home(settings)
+@pytest.fixture(scope="session")
+def migrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An empty database at its head, to be copied: migrating takes longer than most tests."""
+    settings = Settings(home=tmp_path_factory.mktemp("migrated"))
     store = Store(settings)
     schema.migrate(store)
+    store.close()
+    return settings.home / "rsavatar.db"
+
+
+@pytest.fixture
+def store(settings: Settings, migrated: Path) -> Iterator[Store]:
+    make_home(settings)
+    shutil.copy(migrated, settings.home)
+    store = Store(settings)
     yield store
     store.close()
 
