@@ -49,7 +49,8 @@ class Display:
         elif event["kind"] == "note":
             self._console.print(str(event["text"]), markup=False)
         elif event["kind"] == "state":
-            self._console.print(f"job is {event['state']}", markup=False)
+            reason = f": {event['reason']}" if event.get("reason") else ""
+            self._console.print(f"job is {event['state']}{reason}", markup=False)
 
     def _progress(self, event: Mapping[str, Any]) -> None:
         stage, step, steps, state = str(event["stage"]), int(event["step"]), int(event["steps"]), _state(event)

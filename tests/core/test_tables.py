@@ -109,6 +109,14 @@ def test_what_makes_jobs_incomparable_is_said() -> None:
     assert "Metric protocols differ between jobs; see the provenance." in notes
 
 
+def test_a_subjects_own_cameras_are_no_other_protocol() -> None:
+    stated = [json.dumps({"mask_radius_px": 2, "cameras": cameras, "frames": 3}) for cameras in (["00"], ["01", "07"])]
+    rows = [replace(r, protocol=text) for r, text in zip(TWO_METHODS, stated * 2, strict=True)]
+    table = as_json(rows)
+    assert not any("protocols differ" in note for note in table["notes"])
+    assert table["provenance"]["protocol"] == ["mask_radius_px 2"]
+
+
 @pytest.mark.parametrize("name", ["main", "per-subject"])
 @pytest.mark.parametrize("fmt", ["json", "csv", "md", "tex"])
 def test_every_format_carries_its_provenance(name: str, fmt: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
@@ -30,7 +31,7 @@ class Row:
     job_id: str
     commit: str
     data_sha256: str
-    protocol: str
+    protocol: str  # how the metrics were computed: a sentence, or a JSON object
 
 
 # Paper, table "Novel-view synthesis": K = 11, 18 held-out cameras, mean over six subjects of ZJU-MoCap.
@@ -51,6 +52,7 @@ LABELS: dict[str, str] = {
     "flow+gauhuman": "flow + GauHuman",
     "oracle": "true motion (oracle)",
 }
+OF_THE_SUBJECT = frozenset({"cameras", "frames"})  # words of a protocol that differ between subjects by nature
 TOLD_THE_TRUTH = frozenset({"oracle"})  # never the best of a column
 
 
@@ -232,11 +234,22 @@ def _notes(rows: list[Row], lines: list[tuple[Cell, ...]]) -> list[str]:
     notes = [f"LPIPS: weights absent in {absent} of {len(rows)} jobs."] if absent else []
     if len(budgets) > 1:
         notes.append(f"Iterations differ between jobs: {', '.join(map(str, budgets))}.")
-    if len({row.protocol for row in rows}) > 1:
+    if len({_protocol(row) for row in rows}) > 1:
         notes.append("Metric protocols differ between jobs; see the provenance.")
     if any(cell.std is not None for line in lines for cell in line):
         notes.append("± is the sample standard deviation over seeds.")
     return notes
+
+
+def _protocol(row: Row) -> str:
+    """A row's protocol for readers; one in JSON without what is a subject's own, so that equal protocols are equal."""
+    try:
+        stated = json.loads(row.protocol)
+    except ValueError:
+        stated = None
+    if not isinstance(stated, dict):
+        return row.protocol
+    return "; ".join(f"{key} {value}" for key, value in sorted(stated.items()) if key not in OF_THE_SUBJECT)
 
 
 def _stamp(rows: list[Row]) -> tuple[tuple[str, tuple[str, ...]], ...]:
@@ -244,6 +257,6 @@ def _stamp(rows: list[Row]) -> tuple[tuple[str, tuple[str, ...]], ...]:
         "jobs": {row.job_id for row in rows},
         "commits": {row.commit for row in rows},
         "data": {f"{row.subject} sha256 {row.data_sha256[:12]}" for row in rows},
-        "protocol": {row.protocol for row in rows},
+        "protocol": {_protocol(row) for row in rows},
     }
     return tuple((name, tuple(sorted(values))) for name, values in parts.items() if values)
