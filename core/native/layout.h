@@ -33,7 +33,8 @@ struct RsGaussians {
     const float *means, *rotations, *log_scales, *opacity_logits, *sh, *skin_weights, *screen;
 };
 
-// Same shapes as RsGaussians; overwritten. A null pointer: not wanted, not computed.
+// Same shapes as RsGaussians; overwritten. A null pointer: not wanted, not computed. Skinning weights that are 0 get no
+// gradient: a joint that a Gaussian is not bound to is not the optimiser's to add.
 struct RsGradients {
     float *means, *rotations, *log_scales, *opacity_logits, *sh, *skin_weights, *screen, *pose;
 };
@@ -76,10 +77,26 @@ RS_API int rs_render_backward(RsFrame *frame, const RsGaussians *gaussians, cons
 
 // Mean absolute error of an image over a grey background and of its opacity against a mask, with its gradient.
 //   loss = mean_{3HW} |rgb + background * transmittance - target/255| + mask_weight * mean_{HW} |1 - transmittance - mask/255|
-// target [H, W, 3] and mask [H, W] are bytes; target is composited over the background by the mask (target holds
+// target [3, H, W] and mask [H, W] are bytes; target is composited over the background by the mask (target holds
 // premultiplied colour on black). grad_rgb and grad_transmittance are overwritten.
 RS_API double rs_l1(const float *rgb, const float *transmittance, const uint8_t *target, const uint8_t *mask, int height, int width,
              float background, float mask_weight, int threads, float *grad_rgb, float *grad_transmittance);
+
+// Joint angles of B states of one body. Rotations are axis-angle, radians; lengths in metres.
+//   angles, residuals  [B, 24, 3]  a joint turns by exp(angle) exp(residual) relative to its parent; the root's are ignored
+//   root_rotation, root_translation [B, 3]  x_world = exp(Rh) x + Th
+//   rest_joints [24, 3], parents [24] (-1 first, each before its children). residuals may be null.
+struct RsBody {
+    const float *angles, *residuals, *root_rotation, *root_translation, *rest_joints;
+    const int32_t *parents;
+};
+
+// transforms [B, 24, 3, 4], rest to world.
+RS_API void rs_pose(const RsBody *body, int states, float *transforms);
+// Gradients are added to what is there. grad_residuals may be null where residuals is.
+RS_API void rs_pose_backward(const RsBody *body, int states, const float *grad_transforms, float *grad_angles,
+                             float *grad_residuals, float *grad_root_rotation, float *grad_root_translation,
+                             float *grad_rest_joints);
 
 RS_API int rs_lanes(void);  // SIMD lanes of this build, for reports
 }

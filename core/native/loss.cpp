@@ -1,37 +1,76 @@
 // Mean absolute error with its gradient in one pass over the image.
-#include <cstddef>
+#include <algorithm>
 #include <vector>
 
 #include "layout.h"
+#include "simd.h"
 
-static inline float sign(float x, float scale) { return x > 0.f ? scale : x < 0.f ? -scale : 0.f; }
+static inline Floats load_bytes(const uint8_t *p, int n) {
+    typedef uint8_t Bytes __attribute__((vector_size(LANES)));
+    Bytes v = {};
+    memcpy(&v, p, n == LANES ? LANES : n);
+    return __builtin_convertvector(v, Floats) * (1.f / 255.f);
+}
+
+static inline Floats load_some(const float *p, int n) {
+    if (n == LANES) return load(p);
+    Floats v = {};
+    memcpy(&v, p, n * sizeof(float));
+    return v;
+}
+
+static inline void store_some(float *p, Floats v, int n) {
+    if (n == LANES) return store(p, v);
+    memcpy(p, &v, n * sizeof(float));
+}
+
+static inline Floats magnitude(Floats x) { return maximum(x, -x); }
+static inline Floats sign(Floats x, float scale) { return keep(x > 0.f, splat(scale)) - keep(x < 0.f, splat(scale)); }
+
+// One row: returns the sums of |colour error| and |coverage error|. Lanes beyond the row hold zeros and add nothing.
+struct RowError {
+    double colour, coverage;
+};
+
+struct Row {
+    const float *rgb, *transmittance;
+    const uint8_t *target, *mask;
+    float *grad_rgb, *grad_transmittance;
+};
+
+static RowError row_error(const Row &row, size_t plane, int width, float background, float colour_scale, float mask_scale) {
+    Floats colour = {}, coverage = {};
+    for (int x = 0; x < width; x += LANES) {
+        const int n = std::min(LANES, width - x);
+        Floats T = load_some(row.transmittance + x, n), opaque = load_bytes(row.mask + x, n), g_t = {};
+        if (n < LANES)
+            for (int i = n; i < LANES; i++) T[i] = 1.f;
+        for (int p = 0; p < 3; p++) {
+            Floats d = load_some(row.rgb + p * plane + x, n) - load_bytes(row.target + p * plane + x, n) +
+                       background * (T - 1.f + opaque);
+            Floats g = sign(d, colour_scale);
+            colour += magnitude(d), g_t += g;
+            store_some(row.grad_rgb + p * plane + x, g, n);
+        }
+        Floats e = 1.f - T - opaque;
+        coverage += magnitude(e);
+        store_some(row.grad_transmittance + x, background * g_t - sign(e, mask_scale), n);
+    }
+    return {sum(colour), sum(coverage)};
+}
 
 double rs_l1(const float *rgb, const float *transmittance, const uint8_t *target, const uint8_t *mask, int height, int width,
              float background, float mask_weight, int threads, float *grad_rgb, float *grad_transmittance) {
-    const size_t HW = (size_t)height * width;
-    const float colour_scale = 1.f / (3.f * HW), mask_scale = mask_weight / HW, byte = 1.f / 255.f;
-    std::vector<double> colour(height), coverage(height);  // by row, added in order: the same for any number of threads
+    const size_t plane = (size_t)height * width;
+    const float colour_scale = 1.f / (3.f * plane), mask_scale = mask_weight / plane;
+    std::vector<RowError> errors(height);  // added in row order: the same for any number of threads
 #pragma omp parallel for schedule(static) num_threads(threads)
     for (int y = 0; y < height; y++) {
-        float row_colour = 0.f, row_coverage = 0.f;
         const size_t o = (size_t)y * width;
-        for (int x = 0; x < width; x++) {
-            const size_t i = o + x;
-            const float T = transmittance[i], opaque = mask[i] * byte;
-            float g_t = 0.f;
-            for (int p = 0; p < 3; p++) {
-                const float d = rgb[p * HW + i] - target[3 * i + p] * byte + background * (T - 1.f + opaque);
-                row_colour += d < 0.f ? -d : d;
-                const float g = sign(d, colour_scale);
-                grad_rgb[p * HW + i] = g, g_t += g;
-            }
-            const float e = 1.f - T - opaque;
-            row_coverage += e < 0.f ? -e : e;
-            grad_transmittance[i] = background * g_t - sign(e, mask_scale);
-        }
-        colour[y] = row_colour, coverage[y] = row_coverage;
+        const Row row = {rgb + o, transmittance + o, target + o, mask + o, grad_rgb + o, grad_transmittance + o};
+        errors[y] = row_error(row, plane, width, background, colour_scale, mask_scale);
     }
-    double total_colour = 0., total_coverage = 0.;
-    for (int y = 0; y < height; y++) total_colour += colour[y], total_coverage += coverage[y];
-    return total_colour / (3. * HW) + mask_weight * total_coverage / HW;
+    double colour = 0., coverage = 0.;
+    for (const RowError &e : errors) colour += e.colour, coverage += e.coverage;
+    return colour / (3. * plane) + mask_weight * coverage / plane;
 }

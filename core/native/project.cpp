@@ -213,29 +213,28 @@ static void through_own_time(const Posed &p, const Blend &blend, int D, Floats t
     }
 }
 
-// B(tau) = sum_d tau^d sum_j w_j pose[d, j]: to the weights and to the pose's running sums [D][24][12].
+// B(tau) = sum_d tau^d sum_j w_j pose[d, j]: to the weights and to the pose's running sums [D][24][12]. Joints that move
+// no Gaussian of the block are skipped, so a weight of 0 gets no gradient.
 static void through_blend(const Block &block, const RsGaussians &g, const RsGradients &out, const float *pose, int D, Floats tau,
                           Ints live, const TransformGradient &t, Floats *sums) {
+    Floats of[MAX_COEFFICIENTS][12];  // dL / d (sum_j w_j pose[d, j])
+    Floats power = splat(1.f), power_rate = {};  // tau^d and d tau^(d-1)
+    for (int d = 0; d < D; d++) {
+        for (int m = 0; m < 12; m++) of[d][m] = keep(live, power * t.B[m] + power_rate * t.Bd[m]);
+        power_rate = power * (float)(d + 1), power *= tau;
+    }
     for (int j = 0; j < JOINTS; j++) {
-        Floats w = block.get(g.skin_weights + (size_t)j * g.count);
-        if (out.skin_weights) {
-            Floats value = {}, rate = {};
-            for (int d = D - 1; d >= 0; d--) {
-                const float *a = pose + ((size_t)d * JOINTS + j) * 12;
-                Floats e = {}, ed = {};
-                for (int m = 0; m < 12; m++) e += t.B[m] * a[m], ed += t.Bd[m] * a[m];
-                value = value * tau + e;
-                if (d) rate = rate * tau + ed * (float)d;
-            }
-            block.add(out.skin_weights + (size_t)j * g.count, value + rate);
-        }
-        if (!out.pose || !any((w != 0.f) & live)) continue;
-        Floats power = keep(live, w), power_rate = {};  // w tau^d and w d tau^(d-1)
+        size_t row = (size_t)j * g.count;
+        Floats w = block.get(g.skin_weights + row);
+        if (!any(w != 0.f)) continue;
+        Floats of_weight = {};
         for (int d = 0; d < D; d++) {
-            Floats *s = sums + ((size_t)d * JOINTS + j) * 12;
-            for (int m = 0; m < 12; m++) s[m] += power * t.B[m] + power_rate * t.Bd[m];
-            power_rate = power * (float)(d + 1), power *= tau;
+            size_t at = ((size_t)d * JOINTS + j) * 12;
+            for (int m = 0; m < 12; m++) of_weight += of[d][m] * pose[at + m];
+            if (out.pose)
+                for (int m = 0; m < 12; m++) sums[at + m] += w * of[d][m];
         }
+        if (out.skin_weights) block.add(out.skin_weights + row, keep(w != 0.f, of_weight));
     }
 }
 

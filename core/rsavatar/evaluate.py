@@ -13,11 +13,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from rsavatar.body.skinning import joint_transforms, world_transforms
+from rsavatar.body.kinematics import pose
 from rsavatar.data.base import Array, Subject
 from rsavatar.errors import DataError, expected
 from rsavatar.events import Progress, Report
-from rsavatar.geometry.rotations import exp_so3, log_so3
+from rsavatar.geometry.rotations import compose, exp_so3
 from rsavatar.imaging import Actor, expose, plan
 from rsavatar.metrics.base import protocol, score
 from rsavatar.metrics.pose import joint_error_mm, rotation_error_deg, sub_frame_joint_error_mm
@@ -121,8 +121,8 @@ def recovered_motion(actor: Actor, subject: Subject) -> dict[str, Array]:
     found: dict[str, list[Array]] = {"poses": [], "Rh": [], "Th": []}
     for frame in range(subject.frames):
         state = actor.motion.state(frame, offsets)
-        poses = log_so3(actor.local_rotations(state.rotations).double())
-        poses[:, 0] = 0
+        rotations, residuals = state.rotations.double(), actor.residuals(state.rotations)
+        poses = rotations if residuals is None else compose(rotations, residuals.double())
         for name, value in (("poses", poses.flatten(1)), ("Rh", state.Rh), ("Th", state.Th)):
             found[name].append(value.double().numpy())
     stacked = {name: np.stack(values) for name, values in found.items()}
@@ -140,7 +140,7 @@ def _score_motion(actor: Actor, subject: Subject, path: Path) -> dict[str, float
     joints, rotations = _joints(actor, motion, "")
     sub_joints, _ = _joints(actor, motion, "sub_")
     true_pose = torch.from_numpy(truth.mid.poses.reshape(-1, 24, 3))
-    true_rotations = _global_rotations(exp_so3(true_pose), torch.from_numpy(truth.mid.Rh), actor.parents)
+    true_rotations = _global_rotations(exp_so3(true_pose), torch.from_numpy(truth.mid.Rh), actor.parents.tolist())
     return {
         "joint_mm": joint_error_mm(joints, truth.mid_joints),
         "joint_deg": rotation_error_deg(rotations, true_rotations),
@@ -151,17 +151,14 @@ def _score_motion(actor: Actor, subject: Subject, path: Path) -> dict[str, float
 def _joints(actor: Actor, motion: Mapping[str, Array], prefix: str) -> tuple[Array, Array]:
     """World joints [..., 24, 3] and global rotations [..., 24, 3, 3] of a motion's states."""
     poses, Rh, Th = (torch.from_numpy(motion[prefix + name]) for name in ("poses", "Rh", "Th"))
-    rotations = exp_so3(poses.reshape(*poses.shape[:-1], 24, 3))
     rest = (actor.joints + actor.joint_directions @ actor.shapes).double()
-    flat = rotations.reshape(-1, 24, 3, 3)
-    local = joint_transforms(flat, rest, actor.parents)
-    world = world_transforms(local, exp_so3(Rh).reshape(-1, 3, 3), Th.reshape(-1, 3))
+    world = pose(poses.reshape(-1, 24, 3), None, Rh.reshape(-1, 3), Th.reshape(-1, 3), rest, actor.parents)
     joints = (world[..., :3] @ rest[:, :, None])[..., 0] + world[..., 3]
     shape = poses.shape[:-1]
     return joints.reshape(*shape, 24, 3).numpy(), world[..., :3].reshape(*shape, 24, 3, 3).numpy()
 
 
-def _global_rotations(local: Tensor, Rh: Tensor, parents: tuple[int, ...]) -> Array:
+def _global_rotations(local: Tensor, Rh: Tensor, parents: list[int]) -> Array:
     """Joint-to-world rotations [N, 24, 3, 3] of local ones."""
     chain = [exp_so3(Rh)]
     for joint in range(1, 24):

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from rsavatar import __version__, catalog
+from rsavatar import __version__, catalog, kernels
 from rsavatar.body.find import find_body
 from rsavatar.checkpoint import Owner, read_own
 from rsavatar.data.catalogue import open_subject
@@ -22,7 +22,6 @@ from rsavatar.evaluate import Score, evaluate
 from rsavatar.events import Note, Report, silent
 from rsavatar.methods.base import AbstractMethod, Case, build_actor, check_case, observations, settings
 from rsavatar.optimization import Saver
-from rsavatar.render import native
 from rsavatar.spec import JobSpec
 from rsavatar.train import fit
 
@@ -88,7 +87,7 @@ def run(
     subject = open_subject(spec.subject, subject_dir)
     body, which = find_body(spec.body, subject)
     report(Note(which))
-    if not native.available():
+    if not kernels.available():
         report(Note("No native kernels: rendering with the torch twin, several hundred times slower."))
     case = Case(spec, subject, body)
     check_case(case)
@@ -142,7 +141,7 @@ def _provenance(owner: Owner, rejected: int) -> dict[str, Any]:
         "data_sha256": owner.data,
         "body_sha256": owner.body,
         "torch": torch.__version__,
-        "kernels": native.targets()[0] if native.available() else "torch twin",
+        "kernels": kernels.targets()[0] if kernels.available() else "torch twin",
         "threads": torch.get_num_threads(),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, {platform.system()}",
         "rejected_steps": rejected,

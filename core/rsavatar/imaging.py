@@ -10,11 +10,11 @@ from math import cos, pi
 import torch
 from torch import Tensor
 
+from rsavatar import kernels
 from rsavatar.avatar.avatar import Avatar
 from rsavatar.avatar.networks import PoseResidual, SkinOffset, refine
-from rsavatar.body.skinning import joint_transforms, world_transforms
+from rsavatar.body.kinematics import pose
 from rsavatar.geometry.cameras import Camera
-from rsavatar.geometry.rotations import exp_so3
 from rsavatar.motion.base import AbstractMotion
 from rsavatar.render import native, reference
 from rsavatar.render.base import Rendering, Scene, TimedRows
@@ -72,6 +72,7 @@ def polynomials(transforms: Tensor, coefficients: int) -> Tensor:
 class Actor(torch.nn.Module):
     """An avatar that moves: Gaussians, body shape, motion, and the networks that refine them."""
 
+    parents: Tensor
     joints: Tensor
     joint_directions: Tensor
 
@@ -88,28 +89,25 @@ class Actor(torch.nn.Module):
         body = avatar.surface.body
         self.avatar = avatar
         self.motion = motion
-        self.parents = body.parents
         self.pose_offsets = pose_offsets
         self.shapes = torch.nn.Parameter(avatar.surface.shapes.clone())
+        self.register_buffer("parents", torch.tensor(body.parents, dtype=torch.int32), persistent=False)
         self.register_buffer("joints", torch.from_numpy(body.joint_template).float(), persistent=False)
         self.register_buffer("joint_directions", torch.from_numpy(body.joint_directions).float(), persistent=False)
         self.pose_residual = pose_residual
         self.skin_offset = skin_offset
 
-    def local_rotations(self, rotations: Tensor) -> Tensor:
-        """Rotation matrices [D, 24, 3, 3] of axis-angle [D, 24, 3], refined: R_j exp(residual_j) on joints 1..23."""
-        matrices = exp_so3(rotations)
+    def residuals(self, rotations: Tensor) -> Tensor | None:
+        """Residual axis-angle [D, 24, 3] of poses [D, 24, 3] (paper, eq. disp, composed on SO(3)); None without it."""
         if self.pose_residual is None:
-            return matrices
-        residual = exp_so3(self.pose_residual(rotations[:, 1:]))
-        return torch.cat([matrices[:, :1], matrices[:, 1:] @ residual], 1)
+            return None
+        return torch.nn.functional.pad(self.pose_residual(rotations[:, 1:]), (0, 0, 1, 0))
 
     def transforms(self, frame: int, offsets: Tensor) -> Tensor:
         """Canonical-to-world joint transforms [D, 24, 3, 4] of ``frame`` at ``offsets`` source frames from its mid."""
         state = self.motion.state(frame, offsets)
         rest = self.joints + self.joint_directions @ self.shapes
-        local = joint_transforms(self.local_rotations(state.rotations), rest, self.parents)
-        return world_transforms(local, exp_so3(state.Rh), state.Th)
+        return pose(state.rotations, self.residuals(state.rotations), state.Rh, state.Th, rest, self.parents)
 
     def skin_weights(self) -> Tensor:
         """Skinning weights [24, M]; differentiable in the offset network where there is one."""
@@ -121,10 +119,10 @@ class Actor(torch.nn.Module):
         """Everything that one image of ``frame`` needs."""
         offset = None if self.pose_offsets is None else self.pose_offsets[frame]
         means = self.avatar.shaped_means(self.shapes - self.avatar.surface.shapes, offset)
-        pose = polynomials(self.transforms(frame, schedule.offsets), schedule.coefficients)
-        return Scene(self.avatar.gaussians(means, skin_weights, sh_degree), pose, schedule.rows, camera)
+        coefficients = polynomials(self.transforms(frame, schedule.offsets), schedule.coefficients)
+        return Scene(self.avatar.gaussians(means, skin_weights, sh_degree), coefficients, schedule.rows, camera)
 
 
 def expose(scene: Scene) -> Rendering:
     """Render with the native kernels, or, where they could not be built, with the slow float64 twin."""
-    return native.render(scene) if native.available() else reference.render(scene)
+    return native.render(scene) if kernels.available() else reference.render(scene)

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rsavatar.render import native
+from rsavatar import kernels
 from rsavatar.render.base import Rendering
 
 
@@ -17,7 +17,7 @@ class _NativeL1(torch.autograd.Function):
     def forward(ctx: Any, rgb: Tensor, transmittance: Tensor, static: tuple[Tensor, Tensor, float, float]) -> Tensor:
         target, mask, background, mask_weight = static
         ctx.gradients = torch.empty_like(rgb), torch.empty_like(transmittance)
-        value = native.library().rs_l1(
+        value = kernels.library().rs_l1(
             rgb.data_ptr(),
             transmittance.data_ptr(),
             target.data_ptr(),
@@ -47,7 +47,7 @@ def l1(image: Rendering, target: Tensor, mask: Tensor, background: float, mask_w
 
     Args:
         image: [3, H, W] and [H, W].
-        target: [H, W, 3] uint8, premultiplied by coverage, on black.
+        target: [3, H, W] uint8, premultiplied by coverage, on black.
         mask: [H, W] uint8 coverage.
         background: grey level in [0, 1] that both images are laid over.
         mask_weight: at least 0; 0 for the paper's loss.
@@ -55,10 +55,10 @@ def l1(image: Rendering, target: Tensor, mask: Tensor, background: float, mask_w
     Returns:
         A float64 scalar, differentiable in ``image``.
     """
-    if native.available():
+    if kernels.available():
         static = (target.contiguous(), mask.contiguous(), background, mask_weight)
         return _apply(image.rgb.contiguous(), image.transmittance.contiguous(), static)
     coverage = mask.to(image.rgb.dtype) / 255
-    colour = target.permute(2, 0, 1).to(image.rgb.dtype) / 255 + background * (1 - coverage)
+    colour = target.to(image.rgb.dtype) / 255 + background * (1 - coverage)
     error = (image.over(background) - colour).abs().mean()
     return (error + mask_weight * (1 - image.transmittance - coverage).abs().mean()).double()

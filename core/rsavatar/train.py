@@ -30,7 +30,7 @@ class Observation:
     frame: int
     camera: Camera
     schedule: Schedule
-    rgb: Tensor  # [h, w, 3] uint8
+    rgb: Tensor  # [3, h, w] uint8
     mask: Tensor  # [h, w] uint8 coverage
     full_size: tuple[int, int]  # height and width of the uncut image
 
@@ -115,7 +115,7 @@ def _control_density(actor: Actor, state: State, settings: Settings, rules: Dens
 
 
 def _progress(state: State, settings: Settings, loss: float, image: Rendering, seen: Observation) -> Progress:
-    error = image.rgb.detach() - seen.rgb.permute(2, 0, 1) / 255
+    error = image.rgb.detach() - seen.rgb / 255
     psnr = -10 * math.log10(max(float(error.square().mean()), 1e-12))
     count = len(state.gradients.total)
     return Progress("train", state.step, settings.iterations, state.seconds, loss, psnr, count)

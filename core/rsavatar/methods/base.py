@@ -107,7 +107,7 @@ def observations(method: AbstractMethod, case: Case) -> list[Observation]:
             if box is None:  # nobody in the picture: nothing to learn from it
                 continue
             x0, y0, x1, y1 = box
-            pixels = torch.from_numpy(np.ascontiguousarray(rgb[y0:y1, x0:x1]))
+            pixels = torch.from_numpy(np.ascontiguousarray(rgb[y0:y1, x0:x1].transpose(2, 0, 1)))
             coverage = torch.from_numpy(np.ascontiguousarray(mask[y0:y1, x0:x1]))
             schedule = plan(slots, y0, y1)
             cut = camera.cropped(x0, y0, x1, y1)

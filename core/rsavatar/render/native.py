@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
-from functools import cache
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -16,6 +14,7 @@ from torch import Tensor
 
 from rsavatar.errors import KernelError, expected
 from rsavatar.geometry.cameras import Camera
+from rsavatar.kernels import library
 from rsavatar.render.base import Gaussians, Options, Rendering, Scene, TimedRows
 
 _FIELDS = ("means", "rotations", "log_scales", "opacity_logits", "sh", "skin_weights", "screen")
@@ -63,46 +62,6 @@ class _Counters(ctypes.Structure):
 
 
 _REASONS = {1: "out of memory", 2: "an argument is outside the limits of core/native/layout.h"}
-
-
-def targets() -> list[str]:
-    """Instruction sets that this machine has, best first."""
-    capability = torch.backends.cpu.get_cpu_capability()
-    return {"AVX512": ["avx512", "avx2"], "AVX2": ["avx2"]}.get(capability, ["generic"])
-
-
-@cache
-def library() -> Any:
-    """The kernels built for this machine.
-
-    Raises:
-        KernelError: if none was built, or none that this processor can run.
-    """
-    folder = Path(__file__).parent
-    found = [folder / f"_kernels_{t}.so" for t in targets() if (folder / f"_kernels_{t}.so").exists()]
-    if not found:
-        there = ", ".join(sorted(p.name for p in folder.glob("_kernels_*.so"))) or "no kernel library"
-        wanted = f"a library for {' or '.join(targets())} in {folder.name}/ (pip install . builds it)"
-        raise KernelError(expected("native kernels", wanted, there))
-    lib = ctypes.CDLL(str(found[0]))
-    pointer, integer = ctypes.c_void_p, ctypes.c_int
-    lib.rs_frame_create.restype = pointer
-    lib.rs_frame_destroy.argtypes = [pointer]
-    lib.rs_render.argtypes = [pointer, pointer, pointer, integer, integer, *[pointer] * 6]
-    lib.rs_render_backward.argtypes = [pointer] * 8
-    lib.rs_l1.restype = ctypes.c_double
-    float_ = ctypes.c_float
-    lib.rs_l1.argtypes = [pointer] * 4 + [integer, integer, float_, float_, integer, pointer, pointer]
-    return lib
-
-
-def available() -> bool:
-    """Whether the kernels can be used on this machine."""
-    try:
-        library()
-    except KernelError:
-        return False
-    return True
 
 
 class _Frame:

@@ -1,0 +1,55 @@
+"""The native library: which build fits this machine, and the types of its functions (core/native/layout.h)."""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from rsavatar.errors import KernelError, expected
+
+
+def targets() -> list[str]:
+    """Instruction sets that this machine has, best first."""
+    capability = torch.backends.cpu.get_cpu_capability()
+    return {"AVX512": ["avx512", "avx2"], "AVX2": ["avx2"]}.get(capability, ["generic"])
+
+
+@cache
+def library() -> Any:
+    """The kernels built for this machine.
+
+    Raises:
+        KernelError: if none was built, or none that this processor can run.
+    """
+    folder = Path(__file__).parent / "render"
+    found = [folder / f"_kernels_{t}.so" for t in targets() if (folder / f"_kernels_{t}.so").exists()]
+    if not found:
+        there = ", ".join(sorted(p.name for p in folder.glob("_kernels_*.so"))) or "no kernel library"
+        wanted = f"a library for {' or '.join(targets())} in {folder.name}/ (pip install . builds it)"
+        raise KernelError(expected("native kernels", wanted, there))
+    lib = ctypes.CDLL(str(found[0]))
+    pointer, integer = ctypes.c_void_p, ctypes.c_int
+    lib.rs_frame_create.restype = pointer
+    lib.rs_frame_destroy.argtypes = [pointer]
+    lib.rs_render.argtypes = [pointer, pointer, pointer, integer, integer, *[pointer] * 6]
+    lib.rs_render_backward.argtypes = [pointer] * 8
+    lib.rs_l1.restype = ctypes.c_double
+    float_ = ctypes.c_float
+    lib.rs_l1.argtypes = [pointer] * 4 + [integer, integer, float_, float_, integer, pointer, pointer]
+    lib.rs_pose.argtypes = [pointer, integer, pointer]
+    lib.rs_pose_backward.argtypes = [pointer, integer, *[pointer] * 6]
+    lib.rs_pose.restype = lib.rs_pose_backward.restype = None
+    return lib
+
+
+def available() -> bool:
+    """Whether the kernels can be used on this machine."""
+    try:
+        library()
+    except KernelError:
+        return False
+    return True
