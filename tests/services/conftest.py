@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import shutil
 import socket
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 import httpx
 import pytest
 import uvicorn
+from sqlalchemy import text
 
 from services import redis_server
 from services.api.app import create_app
@@ -21,6 +23,9 @@ from services.store import jobs, schema
 from services.store.records import Job, Submission
 from services.store.session import Store
 
+POSTGRESQL = os.environ.get(
+    "RSAVATAR_TEST_DATABASE_URL", ""
+)  # run these tests on PostgreSQL; its public schema is lost
 SPEC = {"method": "gauhuman", "subject": "studio", "preset": "smoke", "priority": 0, "seed": 0, "iterations": 10}
 
 
@@ -36,7 +41,8 @@ def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 @pytest.fixture
 def settings(tmp_path: Path, broker: str) -> Settings:
-    return Settings(home=tmp_path / "home", broker_url=broker, poll_seconds=0.02, ping_seconds=0.1, backoff_seconds=0.0)
+    pace = {"poll_seconds": 0.02, "ping_seconds": 0.1, "backoff_seconds": 0.0}
+    return Settings(home=tmp_path / "home", database_url=POSTGRESQL, broker_url=broker, **pace)
 
 
 @pytest.fixture(scope="session")
@@ -50,12 +56,25 @@ def migrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def store(settings: Settings, migrated: Path) -> Iterator[Store]:
+def empty(settings: Settings) -> Iterator[Store]:
+    """A database without tables."""
     make_home(settings)
-    shutil.copy(migrated, settings.home)
     store = Store(settings)
+    if POSTGRESQL:
+        with store.engine.begin() as connection:
+            connection.execute(text("drop schema public cascade; create schema public"))
     yield store
     store.close()
+
+
+@pytest.fixture
+def store(settings: Settings, migrated: Path, empty: Store) -> Store:
+    """A database at its head, without rows."""
+    if POSTGRESQL:
+        schema.migrate(empty)
+    else:
+        shutil.copy(migrated, settings.home)
+    return empty
 
 
 @contextmanager

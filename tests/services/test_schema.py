@@ -8,10 +8,11 @@ from alembic.migration import MigrationContext
 from sqlalchemy import text
 
 from services.errors import SchemaError, SettingsError
-from services.settings import Settings, make_home
+from services.settings import Settings
 from services.store import schema
 from services.store.session import Store
 from services.store.tables import Base
+from tests.services.conftest import POSTGRESQL
 
 
 def test_migrations_end_in_the_declared_tables(store: Store) -> None:
@@ -19,10 +20,9 @@ def test_migrations_end_in_the_declared_tables(store: Store) -> None:
         assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
 
 
-def test_an_empty_database_is_refused_with_the_remedy(settings: Settings) -> None:
-    make_home(settings)
+def test_an_empty_database_is_refused_with_the_remedy(empty: Store) -> None:
     with pytest.raises(SchemaError, match=r"run `python -m services.migrate`, got an empty database"):
-        schema.require_head(Store(settings))
+        schema.require_head(empty)
 
 
 def test_a_database_of_a_newer_program_is_refused_even_for_migration(store: Store) -> None:
@@ -33,8 +33,7 @@ def test_a_database_of_a_newer_program_is_refused_even_for_migration(store: Stor
             refuse(store)
 
 
-def test_migrating_at_once_from_many_processes_is_safe(settings: Settings) -> None:
-    make_home(settings)
+def test_migrating_at_once_from_many_processes_is_safe(settings: Settings, empty: Store) -> None:
     stores = [Store(settings) for _ in range(4)]
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(schema.migrate, stores))
@@ -43,6 +42,7 @@ def test_migrating_at_once_from_many_processes_is_safe(settings: Settings) -> No
         store.close()
 
 
+@pytest.mark.skipif(bool(POSTGRESQL), reason="of SQLite")
 def test_sqlite_profile(store: Store) -> None:
     with store.read() as session:
         values = [session.scalar(text(f"pragma {name}")) for name in ("journal_mode", "foreign_keys", "busy_timeout")]
