@@ -10,6 +10,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch import Tensor
+
 from rsavatar.body.base import BodyModel
 from rsavatar.body.skinning import (
     easymocap_to_smplx,
@@ -23,8 +25,6 @@ from rsavatar.body.skinning import (
 )
 from rsavatar.body.smpl import load_body
 from rsavatar.geometry.rotations import exp_so3
-from torch import Tensor
-
 from tests.core.bodies import PARENTS, smpl_arrays, write_pickle
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared"
@@ -171,7 +171,8 @@ def smplx_twin(path: Path) -> torch.nn.Module:
         warnings.simplefilter("ignore")  # of the other package: deprecations that we cannot mend
         import smplx
 
-        return smplx.SMPL(str(path), dtype=torch.float64)
+        model: torch.nn.Module = smplx.SMPL(str(path), dtype=torch.float64)
+        return model
 
 
 def compare_with_smplx(path: Path, body: BodyModel, seed: int) -> None:

@@ -23,7 +23,7 @@ from rsavatar.body.smpl import load_body, save_body
 from rsavatar.body.thin import thinned
 from rsavatar.geometry.rotations import exp_so3
 
-FORMAT = 1  # raise it when the conversion changes: it is part of the cache's key
+FORMAT = 2  # raise it when the conversion changes: it is part of the cache's key
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
 POPULATION = 240
 VERTICES = 6890  # as many as SMPL has

@@ -152,7 +152,7 @@ class Targets:
     def _add(self, path: Path, words: tuple[str, ...]) -> None:
         if not path.is_file():
             raise BodyError(expected("free body", f"the target {path.name}", "none"))
-        rows = np.array(gzip.decompress(path.read_bytes()).split(), np.float64).reshape(-1, 4)
+        rows = np.fromstring(gzip.decompress(path.read_bytes()).decode(), np.float64, sep=" ").reshape(-1, 4)
         dense = np.zeros((self._vertices, 3), np.float32)
         dense[rows[:, 0].astype(np.int64)] = rows[:, 1:] * _METRES
         self._words.append(words)

@@ -20,7 +20,7 @@ class _Mesh:
         self.points = vertices
         self.faces = {f: tuple(corners) for f, corners in enumerate(faces.tolist())}
         self.around: list[set[int]] = [set() for _ in vertices]
-        normals = np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]])
+        normals = _normals(vertices[faces])
         area = np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-15)
         planes = np.concatenate([normals, -(normals * vertices[faces[:, 0]]).sum(1, keepdims=True)], 1) / area
         quadrics = planes[:, :, None] * planes[:, None, :] * area[:, :, None]
@@ -35,12 +35,14 @@ class _Mesh:
         """Vertices that share an edge."""
         return {other for f in self.around[vertex] for other in self.faces[f]} - {vertex}
 
-    def cost(self, kept: int, gone: int) -> float:
-        """What putting ``gone`` onto ``kept`` costs."""
-        point = np.append(self.points[kept], 1.0)
-        step = self.points[kept] - self.points[gone]
-        scale = self.quadrics[gone, :3, :3].trace()
-        return float(point @ self.quadrics[gone] @ point + _EVENNESS * scale * (step @ step))
+    def costs(self, kept: Indices, gone: Indices) -> Array:
+        """What putting ``gone`` onto ``kept`` costs, for some pairs."""
+        points = np.concatenate([self.points[kept], np.ones((len(kept), 1))], 1)
+        steps = self.points[kept] - self.points[gone]
+        quadrics = self.quadrics[gone]
+        scale = np.einsum("nii->n", quadrics[:, :3, :3])
+        total: Array = np.einsum("ni,nij,nj->n", points, quadrics, points) + _EVENNESS * scale * (steps**2).sum(1)
+        return total
 
     def can_collapse(self, kept: int, gone: int) -> bool:
         """Whether the surface stays a surface and no triangle turns over; boundary vertices never go."""
@@ -50,13 +52,13 @@ class _Mesh:
             return False
         if len(ring & self.neighbours(kept)) != 2 or len(ring | self.neighbours(kept)) > _MOST_NEIGHBOURS:
             return False
-        return all(self._keeps_side(f, kept, gone) for f in self.around[gone] - shared)
+        return self._keep_sides(self.around[gone] - shared, kept, gone)
 
-    def _keeps_side(self, face: int, kept: int, gone: int) -> bool:
-        before = self.points[list(self.faces[face])]
-        after = self.points[[kept if v == gone else v for v in self.faces[face]]]
-        n0, n1 = (np.cross(p[1] - p[0], p[2] - p[0]) for p in (before, after))
-        return bool(n0 @ n1 > _LEAST_COSINE * np.sqrt((n0 @ n0) * (n1 @ n1)))
+    def _keep_sides(self, faces: set[int], kept: int, gone: int) -> bool:
+        corners = np.array([self.faces[f] for f in sorted(faces)])
+        before, after = _normals(self.points[corners]), _normals(self.points[np.where(corners == gone, kept, corners)])
+        scale = np.sqrt((before**2).sum(1) * (after**2).sum(1))
+        return bool(((before * after).sum(1) > _LEAST_COSINE * scale).all())
 
     def collapse(self, kept: int, gone: int) -> None:
         """Puts ``gone`` onto ``kept``."""
@@ -68,6 +70,12 @@ class _Mesh:
             self.around[kept].add(f)
         self.around[gone] = set()
         self.quadrics[kept] += self.quadrics[gone]
+
+
+def _normals(corners: Array) -> Array:
+    """Normals [N, 3] of triangles [N, 3, 3], twice the area long."""
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return np.stack([a[:, i] * b[:, j] - a[:, j] * b[:, i] for i, j in ((1, 2), (2, 0), (0, 1))], 1)
 
 
 def thinned(vertices: Array, faces: Indices, count: int) -> tuple[Indices, Indices]:
@@ -85,23 +93,29 @@ def thinned(vertices: Array, faces: Indices, count: int) -> tuple[Indices, Indic
     """
     mesh = _Mesh(vertices, faces)
     used = {v for v in range(len(vertices)) if mesh.around[v]}
-    heap = [(mesh.cost(a, b), a, b) for b in sorted(used) for a in mesh.neighbours(b)]
+    heap = _priced(mesh, [(kept, gone) for gone in sorted(used) for kept in sorted(mesh.neighbours(gone))])
     heapq.heapify(heap)
     left = len(used)
     while heap and left > count:
         cost, kept, gone = heapq.heappop(heap)
         if not mesh.around[gone] or not mesh.around[kept]:
             continue
-        now = mesh.cost(kept, gone)
-        if now > cost * (1 + 1e-9):  # its quadric has grown since
-            heapq.heappush(heap, (now, kept, gone))
+        now = _priced(mesh, [(kept, gone)])[0]
+        if now[0] > cost * (1 + 1e-9):  # its quadric has grown since
+            heapq.heappush(heap, now)
         elif mesh.around[kept] & mesh.around[gone] and mesh.can_collapse(kept, gone):
-            ring = mesh.neighbours(gone)
+            ring = sorted(mesh.neighbours(gone) - {kept})
             mesh.collapse(kept, gone)
             left -= 1
-            for other in ring & mesh.neighbours(kept):
-                heapq.heappush(heap, (mesh.cost(kept, other), kept, other))
-                heapq.heappush(heap, (mesh.cost(other, kept), other, kept))
+            pairs = [pair for other in ring for pair in ((kept, other), (other, kept))]
+            for entry in _priced(mesh, pairs):
+                heapq.heappush(heap, entry)
     triangles = np.array([mesh.faces[f] for f in sorted(mesh.faces)], np.int64)
     stay, inverse = np.unique(triangles, return_inverse=True)
     return stay, inverse.reshape(-1, 3)
+
+
+def _priced(mesh: _Mesh, pairs: list[tuple[int, int]]) -> list[tuple[float, int, int]]:
+    """(cost, kept, gone) of each pair (kept, gone)."""
+    kept, gone = np.array(pairs).T
+    return [(cost, *pair) for cost, pair in zip(mesh.costs(kept, gone).tolist(), pairs, strict=True)]

@@ -146,7 +146,7 @@ def biased_noisy_fit(body: BodyModel, truth: BodyFit, seen: list[BodyFit], rng: 
         body: for the number of joints.
         truth: N states at the mid-row times; only its shape coefficients are used.
         seen: for each frame, 24 states: state j at the time at which joint j was exposed.
-        rng: source of the errors: about 3 degrees a joint (half of it in the trunk), 15 mm, 0.15 in each shape coefficient.
+        rng: source of the errors: about 3 degrees a joint (half of it in the trunk), 15 mm, 0.15 a shape coefficient.
     """
     joints = np.arange(JOINTS)
     frames = len(seen)

@@ -65,11 +65,12 @@ def draw(strips: list[Strip], faces: Indices, camera: Camera, paint: Paint, samp
     width = camera.width * samples
     place = scans.row[piece] * width + column
     seen = _nearest(place, nearness, camera.height * samples * width)
-    colour = np.zeros((camera.height * samples * width, 4))
-    colour[place[seen], :3] = paint(scans.triangle[piece[seen]], weights[seen])
-    colour[place[seen], 3] = 1.0
-    pixels = colour.reshape(camera.height, samples, camera.width, samples, 4).mean((1, 3))
-    out = np.floor(np.clip(pixels, 0, 1) * 255 + 0.5).astype(np.uint8)
+    colour = np.ones((len(seen), 4))
+    colour[:, :3] = paint(scans.triangle[piece[seen]], weights[seen])
+    pixel = scans.row[piece[seen]] // samples * camera.width + column[seen] // samples
+    count = camera.height * camera.width
+    sums = np.stack([np.bincount(pixel, channel, count) for channel in colour.T], -1) / samples**2
+    out = np.floor(np.clip(sums, 0, 1) * 255 + 0.5).astype(np.uint8).reshape(camera.height, camera.width, 4)
     return out[..., :3], out[..., 3]
 
 
