@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+from rich.box import SIMPLE
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -140,9 +141,10 @@ def print_table(main: dict[str, Any], console: Console) -> None:
     shown = [
         c for c in main["columns"] if c["key"] not in HIDDEN and any(row[c["key"]] is not None for row in main["rows"])
     ]
-    table = Table()
+    table = Table(box=SIMPLE, padding=(0, 1), pad_edge=False)
     for column in shown:
-        table.add_column(column["title"], justify="left" if column["key"] == "method" else "right")
+        is_name = column["key"] == "method"
+        table.add_column(column["title"], justify="left" if is_name else "right", no_wrap=is_name)
     for row in main["rows"]:
         table.add_row(*(text_of(row[column["key"]]) for column in shown))
     console.print(table)
@@ -151,8 +153,10 @@ def print_table(main: dict[str, Any], console: Console) -> None:
 
 
 def text_of(value: str | float | None) -> str:
-    """A value of the table's JSON, short."""
-    return f"{value:.3f}".rstrip("0").rstrip(".") if isinstance(value, float) else "–" if value is None else str(value)
+    """A value of the table's JSON, in four digits."""
+    if value is None:
+        return "–"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def demonstrate(options: argparse.Namespace, settings: Settings, console: Console) -> bool:

@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from services.store.records import TERMINAL, Artifact, Job, Outcome, Subject
+from services.store.records import TERMINAL, Artifact, Job, Outcome, State, Subject, fraction_of
 
 
 def instant(seconds: float | None) -> datetime | None:
@@ -84,9 +84,9 @@ class JobView(BaseModel):
 
 def progress_of(job: Job) -> ProgressView:
     """Progress columns of a job; a succeeded job is whole."""
-    fraction = 1.0 if job.state == "succeeded" else job.step / job.steps if job.steps else 0.0
+    fraction = 1.0 if job.state == State.SUCCEEDED else fraction_of(job.stage, job.step, job.steps)
     names = ("stage", "step", "steps", "loss", "psnr", "gaussians", "eta_seconds")
-    return ProgressView(fraction=min(1.0, fraction), **{name: getattr(job, name) for name in names})
+    return ProgressView(fraction=fraction, **{name: getattr(job, name) for name in names})
 
 
 class JobDetail(JobView):

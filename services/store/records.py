@@ -34,6 +34,15 @@ class Failure(StrEnum):
     BUG = "bug"
 
 
+SHARES = {"train": (0.0, 0.9), "evaluate": (0.9, 0.1)}  # where a stage begins in the whole job, and its share
+
+
+def fraction_of(stage: str | None, step: int, steps: int) -> float:
+    """How much of a job is done, by its newest look; other stages prepare, and count as nothing."""
+    start, share = SHARES.get(stage or "", (0.0, 0.0))
+    return min(1.0, start + share * step / steps) if steps else start
+
+
 @dataclass(frozen=True)
 class Job:
     """A row of the queue of record."""

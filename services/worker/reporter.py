@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from services.store import artifacts
-from services.store.records import Artifact, Batch, Event, Look, Point
+from services.store.records import Artifact, Batch, Event, Look, Point, fraction_of
 
 CURVES = ("loss", "psnr", "gaussians")
 
@@ -76,4 +76,5 @@ class Reporter:
 
 
 def _fields(look: Look) -> dict[str, Any]:
-    return {name: value for name, value in vars(look).items() if value is not None}
+    done = fraction_of(look.stage, look.step, look.steps)
+    return {"fraction": done} | {name: value for name, value in vars(look).items() if value is not None}

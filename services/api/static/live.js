@@ -25,7 +25,7 @@ function showState(place, state) {
 }
 
 function showProgress(place, event) {
-  place.querySelector("[data-field=bar]").value = event.steps ? event.step / event.steps : 0;
+  place.querySelector("[data-field=bar]").value = event.fraction;
   put(place, "steps", `${event.stage} ${event.step}/${event.steps}`);
   put(place, "eta", event.eta_seconds > 0 ? `${Math.ceil(event.eta_seconds)} s left` : "");
   put(place, "loss", fixed(event.loss, 4));
