@@ -41,7 +41,7 @@ _ROW_TIME = "t(v) = mid + delta_c + gamma*K*(v/H - 1/2), v = 0..H-1, source-fram
 def studio_subject_dir(seed: int = 0) -> Path:
     """Folder of the studio subject of a seed, built into the cache when it is not there yet; built once only."""
     name = "studio" if seed == 0 else f"studio-{seed}"
-    out = cache_dir() / f"studio-{FORMAT}-anny-{anny_version()}-{BODY_FORMAT}" / name
+    out = cache_dir() / f"studio-{FORMAT}-{SIZE}x{FRAMES}-anny-{anny_version()}-{BODY_FORMAT}" / name
     out.parent.mkdir(exist_ok=True)
     with _locked(out.parent / f"{name}.lock"):
         return build(out, seed=seed)
