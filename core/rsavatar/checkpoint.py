@@ -56,7 +56,8 @@ def read(path: Path) -> tuple[dict[str, Tensor], Owner, int]:
             header = file.metadata() or {}
             if header.get("format") != str(FORMAT):
                 raise CheckpointError(expected(f"{path.name} format", FORMAT, header.get("format")))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
+            # cloned: the file's own memory is not aligned, and vector code rounds unaligned sums differently
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 - no mapping
             return tensors, Owner(**json.loads(header["owner"])), int(header["step"])
     except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         raise CheckpointError(expected(str(path), "a whole checkpoint file", error)) from None

@@ -114,8 +114,12 @@ def run(
 
 
 def _use_threads() -> None:
-    """RSAVATAR_THREADS, or all cores that this process may use; the result does not depend on it."""
-    torch.set_num_threads(int(os.environ.get("RSAVATAR_THREADS", len(os.sched_getaffinity(0)))))
+    """RSAVATAR_THREADS for the kernels, or all cores that this process may use; the result does not depend on it.
+
+    Torch itself gets one: its sums depend on the number of threads, and its tensors here are small.
+    """
+    kernels.use_threads(int(os.environ.get("RSAVATAR_THREADS", len(os.sched_getaffinity(0)))))
+    torch.set_num_threads(1)
 
 
 def _checkpoint_file(out: Path, owner: Owner, report: Report) -> Path:
@@ -142,7 +146,7 @@ def _provenance(owner: Owner, rejected: int) -> dict[str, Any]:
         "body_sha256": owner.body,
         "torch": torch.__version__,
         "kernels": kernels.targets()[0] if kernels.available() else "torch twin",
-        "threads": torch.get_num_threads(),
+        "threads": kernels.threads(),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, {platform.system()}",
         "rejected_steps": rejected,
     }

@@ -12,6 +12,20 @@ import torch
 from rsavatar.errors import KernelError, expected
 
 
+class _Threads:
+    count = 1
+
+
+def use_threads(count: int) -> None:
+    """Let the kernels use ``count`` threads from now on. Results do not depend on it."""
+    _Threads.count = max(count, 1)
+
+
+def threads() -> int:
+    """Threads that the kernels use; torch's own number does not matter to them."""
+    return _Threads.count
+
+
 def targets() -> list[str]:
     """Instruction sets that this machine has, best first."""
     capability = torch.backends.cpu.get_cpu_capability()

@@ -25,7 +25,7 @@ class _NativeL1(torch.autograd.Function):
             *transmittance.shape,
             background,
             mask_weight,
-            torch.get_num_threads(),
+            kernels.threads(),
             *(g.data_ptr() for g in ctx.gradients),
         )
         return torch.tensor(value, dtype=torch.float64)

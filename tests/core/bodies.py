@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse
+
 from rsavatar.body.base import BodyModel
 from rsavatar.body.smpl import load_body, save_body
 

@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import torch
+
 from rsavatar.geometry.cameras import Camera
 from rsavatar.geometry.rotations import exp_so3
 from rsavatar.render.base import Gaussians, Options, Scene, TimedRows

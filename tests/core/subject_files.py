@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 from PIL import Image
+
 from rsavatar.body.base import JOINTS, BodyModel
 from rsavatar.body.skinning import posed_vertices
 from rsavatar.body.smpl import save_body

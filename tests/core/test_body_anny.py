@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from rsavatar.body.anny import anny_body, draw_phenotypes, load_converter
 from rsavatar.body.base import Array, BodyModel, Indices
 from rsavatar.body.find import find_body

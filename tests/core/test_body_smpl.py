@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.sparse
+
 from rsavatar.body.base import BodyModel
 from rsavatar.body.find import find_body
 from rsavatar.body.smpl import load_body, save_body
 from rsavatar.errors import BodyError
-
 from tests.core.bodies import PARENTS, saved, smpl_arrays, synthetic_body, write_pickle
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared"

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
 from rsavatar import cli_local
 from rsavatar.cli import main
 from rsavatar.cli_progress import Display, print_means
@@ -19,7 +20,6 @@ from rsavatar.cli_request import parse_setting, read_request
 from rsavatar.errors import SpecError
 from rsavatar.events import Note, Progress, to_json
 from rsavatar.spec import resolve
-
 from tests.core.live_service import Service, live_service
 
 VERBS = ["run", "bench", "data check", "data studio", "submit", "watch", "jobs", "table", "cancel", "retry", "subjects"]

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rsavatar.cli import main
 
+from rsavatar.cli import main
 from tests.core.subject_files import FRAMES, TEST, write_rolling
 
 WORDS = ("run", "smoke", "--set", "method=gauhuman")

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
 from rsavatar import client as client_module
 from rsavatar.client import Client, ServerEvent, parse_events
 from rsavatar.errors import ClientError
-
 from tests.core.live_service import Service, live_service
 
 JOB = {"preset": "smoke", "method": "gauhuman", "subject": "studio"}

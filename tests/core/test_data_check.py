@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+
 from rsavatar.data.check import Report, check, render
 from rsavatar.data.silhouettes import silhouette, target_of
 from rsavatar.geometry.cameras import Camera
-
 from tests.core.subject_files import FRAMES, SIZE, TRAIN, edit, figure, write_rolling, write_zju
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared"

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from rsavatar.data.npy import load_plain
 from rsavatar.errors import DataError
-
 from tests.core.subject_files import save_object
 
 

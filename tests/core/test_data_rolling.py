@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+
 from rsavatar.data.catalogue import open_subject
 from rsavatar.data.rolling import load
 from rsavatar.errors import DataError
-
 from tests.core.subject_files import FRAMES, SIZE, TRAIN, edit, load_object, matrix, ring, write_rolling
 
 SUBJECTS = Path(__file__).resolve().parents[2].parent / "shared" / "subjects"

@@ -8,12 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+
 from rsavatar.body.skinning import posed_vertices
 from rsavatar.data.catalogue import open_subject
 from rsavatar.data.easymocap import SmplxFit, from_smplx, read_calibrations, read_frames, to_smplx
 from rsavatar.data.zju import load
 from rsavatar.errors import DataError
-
 from tests.core.subject_files import FRAMES, edit, figure, matrix, motion, ring, write_zju
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+
 from rsavatar import kernels
 from rsavatar.body import kinematics
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+
 from rsavatar import kernels
 from rsavatar.losses import l1
 from rsavatar.render.base import Rendering
@@ -42,11 +43,11 @@ def test_the_number_of_threads_does_not_matter() -> None:
     g = torch.Generator().manual_seed(0)
     image = Rendering(torch.rand(3, 61, 47, generator=g), torch.rand(61, 47, generator=g))
     target = torch.randint(0, 256, (3, 61, 47), generator=g, dtype=torch.uint8)
-    before, values = torch.get_num_threads(), set()
+    before, values = kernels.threads(), set()
     try:
         for threads in (1, 2, 5):
-            torch.set_num_threads(threads)
+            kernels.use_threads(threads)
             values.add(float(l1(image, target, target[0], 0.2, 0.3)))
     finally:
-        torch.set_num_threads(before)
+        kernels.use_threads(before)
     assert len(values) == 1

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from rsavatar import catalog
 from rsavatar.errors import DataError
 from rsavatar.metrics import base, image

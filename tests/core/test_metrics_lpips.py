@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
+
 from rsavatar.errors import DataError
 from rsavatar.metrics import image, lpips
 from rsavatar.metrics.image import Image, Mask
-from safetensors.torch import save_file
 
 LAYERS = (64, 64, "pool", 128, 128, "pool", 256, 256, 256, "pool", 512, 512, 512, "pool", 512, 512, 512)
 State = dict[str, torch.Tensor]

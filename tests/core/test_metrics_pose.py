@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+
 from rsavatar.errors import DataError
 from rsavatar.metrics.pose import Array, joint_error_mm, rotation_error_deg, sub_frame_joint_error_mm
 from rsavatar.metrics.timing import Stopwatch
-from scipy.spatial.transform import Rotation
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared"
 RNG = np.random.default_rng(5)

@@ -7,12 +7,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.interpolate import BSpline
+from torch import Tensor
+
 from rsavatar.geometry.rotations import exp_so3
 from rsavatar.motion.base import InitialMotion, unwrap
 from rsavatar.motion.spline import POSITIVE_RANGE, ZERO_MEAN_DEVIATION, FrameSpline, basis_matrix
 from rsavatar.motion.still import StillPose
-from scipy.interpolate import BSpline
-from torch import Tensor
 
 PERIOD = 11.0
 ORDERS = st.integers(2, 8)  # what a job may ask for

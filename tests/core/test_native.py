@@ -6,12 +6,12 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
+from torch import Tensor
+
 from rsavatar import kernels
 from rsavatar.errors import KernelError
 from rsavatar.render import native, reference
 from rsavatar.render.base import Gaussians, Rendering, Scene, TimedRows
-from torch import Tensor
-
 from tests.core import scenes
 
 pytestmark = pytest.mark.skipif(not kernels.available(), reason="no native kernels were built for this machine")
@@ -53,14 +53,14 @@ def test_image_and_gradients_of_every_input_equal_the_twin(kind: str, bases: int
 @pytest.mark.parametrize("kind", scenes.KINDS)
 def test_any_number_of_threads_gives_the_same_bits(kind: str) -> None:
     s = scenes.scene(kind, count=400, dtype=torch.float32)
-    before = torch.get_num_threads()
+    before = kernels.threads()
     runs = []
     try:
         for threads in (1, 2, 3, 2):
-            torch.set_num_threads(threads)
+            kernels.use_threads(threads)
             runs.append(gradients(native.render, s))
     finally:
-        torch.set_num_threads(before)
+        kernels.use_threads(before)
     for image, grads in runs[1:]:
         assert torch.equal(image.rgb, runs[0][0].rgb)
         assert all(torch.equal(grads[name], runs[0][1][name]) for name in grads)

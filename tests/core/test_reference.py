@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
+
 from rsavatar.geometry.cameras import Camera
 from rsavatar.geometry.rotations import exp_so3, quaternion_to_matrix
 from rsavatar.render.base import Gaussians, Options, Rendering, Scene, TimedRows
 from rsavatar.render.reference import C0, C1, project, render, render_rows
 from rsavatar.shutter.base import AbstractShutter
 from rsavatar.shutter.rolling import Bands, Scanline
-from torch import Tensor
 
 H, W, F = 24, 32, 40.0
 ROUNDING = 1e-12

@@ -8,6 +8,9 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
 from rsavatar.geometry.rotations import (
     compose,
     exp_so3,
@@ -16,8 +19,6 @@ from rsavatar.geometry.rotations import (
     quaternion_to_matrix,
     rotvec_distance,
 )
-from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 ROUNDING = 1e-14  # float64, a few dozen operations on numbers of order 1
 ANGLES = [0.0, 1e-12, 1e-7, 1e-3, 1.0, math.pi - 1e-3, math.pi - 1e-8, math.pi, math.pi + 0.5, 2 * math.pi, 7.0]

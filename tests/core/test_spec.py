@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from rsavatar.catalog import DESCRIPTIONS, METHODS
 from rsavatar.errors import SpecError
 from rsavatar.spec import FLAGS_OF_METHOD, Ablation, JobSpec, presets_dir, read_preset, resolve

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from rsavatar.body.skinning import posed_vertices
 from rsavatar.data import studio
 from rsavatar.data.base import Array

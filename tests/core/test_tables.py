@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from rsavatar.errors import SpecError
 from rsavatar.report.tables import PAPER_MAIN, Row, render, render_main, render_per_subject
 

@@ -1,6 +1,6 @@
 """The renderer on the native kernels: ``render(scene)``, differentiable, bit-identical for any number of threads.
 
-Layouts are those of ``core/native/layout.h``; tensors cross without a copy. The kernels use as many threads as torch.
+Layouts are those of ``core/native/layout.h``; tensors cross without a copy. The threads are ``kernels.threads()``.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from rsavatar.errors import KernelError, expected
 from rsavatar.geometry.cameras import Camera
-from rsavatar.kernels import library
+from rsavatar.kernels import library, threads
 from rsavatar.render.base import Gaussians, Options, Rendering, Scene, TimedRows
 
 _FIELDS = ("means", "rotations", "log_scales", "opacity_logits", "sh", "skin_weights", "screen")
@@ -86,8 +86,8 @@ def _c_camera(camera: Camera) -> _Camera:
 
 
 def _c_options(o: Options) -> _Options:
-    threads = torch.get_num_threads()
-    return _Options(o.near, o.dilation, o.alpha_min, o.alpha_max, o.transmittance_min, o.strip_rows, threads)
+    limits = (o.near, o.dilation, o.alpha_min, o.alpha_max, o.transmittance_min)
+    return _Options(*limits, o.strip_rows, threads())
 
 
 def _c_gaussians(tensors: tuple[Tensor, ...]) -> _Gaussians:

@@ -1,0 +1,46 @@
+# make demo   set up, run three jobs through the service on the built-in subject, print the table
+# make up     serve API, worker and page on http://127.0.0.1:8000 until stopped
+# make test   set up, run all tests
+# make check  format, lint, types, import contracts
+# make bench  the long measurements; results in docs/benchmarks
+
+PYTHON ?= python3
+BIN := .venv/bin
+SETUP := .venv/.complete
+
+.PHONY: setup demo up test check bench clean
+.DEFAULT_GOAL := help
+
+help:
+	@sed -n 's/^# //p' Makefile
+
+setup: $(SETUP)
+
+# Depends on what decides the installation, so a change of kernels or dependencies sets up again.
+$(SETUP): pyproject.toml setup.py $(wildcard core/native/*)
+	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and f"python: expected 3.11 or newer, got {v[0]}.{v[1]} (set PYTHON=...)")'
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $@
+
+demo: $(SETUP)
+	$(BIN)/python -m services.demo
+
+up: $(SETUP)
+	$(BIN)/python -m services.up
+
+test: $(SETUP)
+	$(BIN)/python -m pytest
+
+check: $(SETUP)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(SETUP)
+	$(BIN)/rsavatar bench render --json docs/benchmarks/render.json
+	$(BIN)/rsavatar bench train --json docs/benchmarks/train.json
+
+clean:
+	rm -rf .venv build core/*.egg-info core/rsavatar/render/_kernels_*.so
