@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+
 from rsavatar.catalog import MOTIONS, load
 from rsavatar.motion.base import AbstractMotion, BodyState, InitialMotion
 from rsavatar.motion.spline import FrameSpline

@@ -7,6 +7,7 @@ import math
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from rsavatar.errors import SpecError
 from rsavatar.shutter.base import AbstractShutter, Slot
 from rsavatar.shutter.rolling import Bands, Blur, Instant, Scanline
