@@ -8,8 +8,8 @@ from pathlib import Path
 
 from fastapi import APIRouter, FastAPI
 from fastapi.staticfiles import StaticFiles
-from rsavatar import __version__
 
+from rsavatar import __version__
 from services import jobs as wake_up
 from services.api import artifacts, catalogue, events, health, jobs, pages, problems, subjects, tables
 from services.api.deps import Backend

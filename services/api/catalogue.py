@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from fastapi import APIRouter
+
 from rsavatar.catalog import DESCRIPTIONS, METHODS
 from rsavatar.spec import FLAGS_OF_METHOD, JobSpec, presets_dir, read_preset
-
 from services.api.views import MethodView
 
 router = APIRouter(tags=["catalogue"])

@@ -9,8 +9,8 @@ from pathlib import Path
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse
 from fastapi.templating import Jinja2Templates
-from rsavatar.report.tables import render
 
+from rsavatar.report.tables import render
 from services.api.deps import Back, Backend, JobId
 from services.api.tables import rows_of
 from services.api.views import ArtifactView, JobDetail, JobView

@@ -11,9 +11,9 @@ from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel
-from rsavatar.errors import SpecError
 from starlette.exceptions import HTTPException
 
+from rsavatar.errors import SpecError
 from services.errors import ConflictError, NotFoundError, RequestError, ServiceError
 
 MEDIA_TYPE = "application/problem+json"

@@ -11,8 +11,8 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, GetJsonSchemaHandler, JsonValue, RootModel
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
-from rsavatar.spec import JobSpec, resolve
 
+from rsavatar.spec import JobSpec, resolve
 from services.api.deps import UUID
 from services.errors import RequestError
 from services.store.records import State

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 from fastapi import APIRouter, Response
+
 from rsavatar.report.tables import TABLES, Row, render
 from rsavatar.spec import Preset
-
 from services.api.deps import Back
 from services.errors import NotFoundError
 from services.store import metrics

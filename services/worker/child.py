@@ -27,7 +27,6 @@ from typing import IO, Any, Protocol
 
 from rsavatar import errors, events
 from rsavatar.spec import JobSpec
-
 from services.process import die_with_parent
 
 LOCK_SECONDS = 10.0  # an orphan of an earlier attempt has this long to disappear

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import httpx
 import pytest
-from rsavatar.catalog import METHODS
 
+from rsavatar.catalog import METHODS
 from services.settings import Settings
 from services.store.session import Store
 from tests.services.conftest import serving

@@ -3,8 +3,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from rsavatar import errors
 
+from rsavatar import errors
 from services.worker.child import describe
 from services.worker.reporter import Reporter
 from services.worker.supervisor import child_environment, describe_death

@@ -121,13 +121,13 @@ class Host:
         view: dict[str, Any] = self.client.get(f"/api/v1/jobs/{job_id}").json()
         return view
 
-    def wait_for(self, job_id: str, *states: str) -> dict[str, Any]:
+    def wait_for(self, job_id: str, *states: str, seconds: float = PATIENCE) -> dict[str, Any]:
         """Wait until the job is in one of ``states``."""
-        return until(lambda: view if (view := self.job(job_id))["state"] in states else {})
+        return until(lambda: view if (view := self.job(job_id))["state"] in states else {}, seconds)
 
-    def wait_for_step(self, job_id: str, step: int) -> None:
+    def wait_for_step(self, job_id: str, step: int, seconds: float = PATIENCE) -> None:
         """Wait until the job has got so far."""
-        until(lambda: self.job(job_id)["progress"]["step"] >= step)
+        until(lambda: self.job(job_id)["progress"]["step"] >= step, seconds)
 
     def state(self, job_id: str) -> str:
         """What the quick child computed: depends on every step."""

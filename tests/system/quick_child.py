@@ -19,7 +19,6 @@ from typing import Any
 
 from rsavatar import errors, events
 from rsavatar.spec import JobSpec
-
 from services.worker.child import serve
 
 STEP_SECONDS = 0.01

@@ -9,6 +9,12 @@ const verbs = {
   failed: ["retry"], dead: ["retry"], cancelled: ["retry"], succeeded: [],
 };
 const curves = new Map();
+let reloading = 0;
+
+function reloadSoon() { // once, however many events ask for it
+  clearTimeout(reloading);
+  reloading = setTimeout(() => location.reload(), 800);
+}
 
 const fixed = (value, digits) => (value === undefined || value === null ? null : Number(value).toFixed(digits));
 
@@ -92,14 +98,14 @@ function take(message) {
   const event = JSON.parse(message.data);
   const place = document.querySelector(`[data-job="${event.job_id}"]`);
   if (!place) {
-    if (!detail && event.kind === "state" && event.state === "queued") location.reload();
+    if (!detail && event.kind === "state" && event.state === "queued") reloadSoon();
     return;
   }
   if (event.kind === "progress") showProgress(place, event);
   if (event.kind === "state") showState(place, event.state);
   if (event.kind === "state" && event.means) put(place, "psnr", fixed(event.means.psnr, 2));
   if (!detail) {
-    if (event.kind === "state" && event.state === "succeeded") location.reload();
+    if (event.kind === "state" && event.state === "succeeded") reloadSoon();
     return;
   }
   if (event.kind === "progress") addPoint(event);
@@ -109,7 +115,7 @@ function take(message) {
   if (event.kind !== "state") return;
   showVerbs(event.state);
   if (event.reason) addNote(`${event.state}: ${event.reason.split("\n", 1)[0]}`);
-  if (terminal.has(event.state) && event.id > Number(document.body.dataset.newest)) location.reload();
+  if (terminal.has(event.state) && event.id > Number(document.body.dataset.newest)) reloadSoon();
 }
 
 function listen() {
@@ -133,7 +139,7 @@ async function start() {
         const reply = await fetch(`${api}/jobs/${jobId}/${button.dataset.verb}`, { method: "POST" });
         if (!reply.ok) addNote((await reply.json()).detail);
         button.disabled = false;
-        if (reply.ok) location.reload();
+        if (reply.ok) reloadSoon();
       });
     }
   }
