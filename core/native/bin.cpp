@@ -103,6 +103,6 @@ void bin(RsFrame &frame, int index, int count) {
             slot.entry_splat[at] = k, slot.entry_pair[at] = pair;
         }
     }
-    if (slot.rows.rate != 0.f)
+    if (slot.rows.rate != 0.f && !(frame.options.flags & RS_NO_RESORT))
         for (int strip = 0; strip < slot.strips; strip++) resort(frame, slot, strip);
 }

@@ -50,9 +50,12 @@ struct RsCamera {
     int32_t height, width;
 };
 
+// Bits of RsOptions.flags: corrections of own time that are left out, to measure what each is worth.
+enum RsFlag { RS_NO_SHEAR = 1, RS_NO_IMPLICIT = 2, RS_NO_RESORT = 4 };
+
 struct RsOptions {
     float near, dilation, alpha_min, alpha_max, transmittance_min;
-    int32_t strip_rows, threads;
+    int32_t strip_rows, threads, flags;
 };
 
 // What the plan of a frame came to; see RsFrame.

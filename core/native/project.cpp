@@ -56,7 +56,8 @@ static void project_block(const RsFrame &frame, const RsGaussians &g, const floa
     opacity_of(block.get(g.opacity_logits), opacity, log2_opacity);
 
     // Within the footprint the mean moves (a, b) pixels per row: the conic is sheared, and so is its box.
-    Floats a = p.ud * slot.rows.rate, slack = scan_slack(slot.rows.rate, p.vd), shear = a / slack;
+    float moving = o.flags & RS_NO_SHEAR ? 0.f : slot.rows.rate;
+    Floats a = p.ud * moving, slack = scan_slack(moving, p.vd), shear = a / slack;
     Floats A = f.A, B = slack * f.B - a * f.A, C = a * a * f.A - 2.f * a * slack * f.B + slack * slack * f.C;
     Floats reach = maximum((log2_opacity - log2(splat(o.alpha_min))) * (2.f / LOG2_E) * 1.0001f + 1e-4f, Floats{});
     Floats half_x = square_root(reach * maximum(f.sxx + 2.f * shear * f.sxy + shear * shear * f.syy, Floats{}));
@@ -261,12 +262,14 @@ static void backward_block(const RsFrame &frame, const RsGaussians &g, const RsG
     Floats opacity, log2_opacity;
     opacity_of(block.get(g.opacity_logits), opacity, log2_opacity);
 
-    Floats a = p.ud * rate, slack = scan_slack(rate, p.vd);
+    int flags = frame.options.flags;
+    float moving = flags & RS_NO_SHEAR ? 0.f : rate;
+    Floats a = p.ud * moving, slack = scan_slack(moving, p.vd);
     SplatGradient sg = splat_gradient(moments, f.A, slack * f.B - a * f.A,
                                       a * a * f.A - 2.f * a * slack * f.B + slack * slack * f.C, opacity);
     if (out.opacity_logits) block.add(out.opacity_logits, sg.logit);
     if (out.screen) block.add(out.screen, sg.u), block.add(out.screen + g.count, sg.v);
-    PosedGradient pg = through_projection(sg, p, f, cam, rate);
+    PosedGradient pg = through_projection(sg, p, f, cam, moving);
     through_shading(block, g, out, shading, sg, pg);
 
     Vec3 world = from_camera(cam, pg.camera) + pg.world, world_rate = from_camera(cam, pg.velocity);
@@ -278,7 +281,7 @@ static void backward_block(const RsFrame &frame, const RsGaussians &g, const RsG
         t.B[4 * r + 2] = from_shape.z + w[r] * x.z, t.B[4 * r + 3] = w[r];
         t.Bd[4 * r] = wd[r] * x.x, t.Bd[4 * r + 1] = wd[r] * x.y, t.Bd[4 * r + 2] = wd[r] * x.z, t.Bd[4 * r + 3] = wd[r];
     }
-    if (rate != 0.f) through_own_time(p, blend, D, tau, rate, cam, x, t, world);
+    if (rate != 0.f && !(flags & RS_NO_IMPLICIT)) through_own_time(p, blend, D, tau, rate, cam, x, t, world);
     if (out.means) {
         Vec3 gx = mul_transposed(p.linear(), world) + mul_transposed(p.linear_rate(), world_rate);
         block.add(out.means, gx.x), block.add(out.means + g.count, gx.y), block.add(out.means + 2 * (size_t)g.count, gx.z);

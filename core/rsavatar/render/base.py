@@ -8,11 +8,14 @@ Layouts are channel-first (structure of arrays) so that the kernels read them wi
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from rsavatar.geometry.cameras import Camera
+
+Correction = Literal["shear", "implicit", "resort"]  # of own time: footprint, derivative, depth order (reference.py)
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,7 @@ class Options:
     alpha_max: float = 0.99  # cap of one splat's opacity; the gradient is zero where it acts
     transmittance_min: float = 1e-4  # a pixel stops before its transmittance would fall under this
     strip_rows: int = 16  # rows that share one depth order; strips start at each slot's first row
+    without: frozenset[Correction] = frozenset()  # left out, to measure what each is worth
 
 
 @dataclass(frozen=True)

@@ -54,6 +54,7 @@ class _Options(ctypes.Structure):
         *((name, ctypes.c_float) for name in ("near", "dilation", "alpha_min", "alpha_max", "transmittance_min")),
         ("strip_rows", ctypes.c_int32),
         ("threads", ctypes.c_int32),
+        ("flags", ctypes.c_int32),
     )
 
 
@@ -61,6 +62,7 @@ class _Counters(ctypes.Structure):
     _fields_ = (("splats", ctypes.c_int64), ("pairs", ctypes.c_int64))
 
 
+_FLAGS = {"shear": 1, "implicit": 2, "resort": 4}
 _REASONS = {1: "out of memory", 2: "an argument is outside the limits of core/native/layout.h"}
 
 
@@ -87,7 +89,7 @@ def _c_camera(camera: Camera) -> _Camera:
 
 def _c_options(o: Options) -> _Options:
     limits = (o.near, o.dilation, o.alpha_min, o.alpha_max, o.transmittance_min)
-    return _Options(*limits, o.strip_rows, threads())
+    return _Options(*limits, o.strip_rows, threads(), sum(_FLAGS[name] for name in o.without))
 
 
 def _c_gaussians(tensors: tuple[Tensor, ...]) -> _Gaussians:

@@ -123,16 +123,17 @@ def project(gaussians: Gaussians, pose: Tensor, rows: TimedRows, camera: Camera,
     gaussians, tau = _select(gaussians, kept), tau[kept]
 
     coefficients = torch.einsum("jm,djrc->dmrc", gaussians.skin_weights, pose)
-    if rows.rate != 0:
+    if rows.rate != 0 and "implicit" not in options.without:
         at_root = _pose(coefficients, gaussians.means, tau, camera, options)
         residual = tau - (rows.rate * at_root.v + rows.start)
         step = residual / (1 - rows.rate * at_root.v_rate).detach()
         tau = torch.where(tau.abs() < 1, tau - step, tau)  # value unchanged; derivative of the implicit function
     posed = _pose(coefficients, gaussians.means, tau, camera, options)
+    moving = 0.0 if "shear" in options.without else rows.rate
     return Splats(
         u=posed.u + gaussians.screen[0],
         v=posed.v + gaussians.screen[1],
-        conic=_shear(_conic(gaussians, posed, camera, options), rows.rate * posed.u_rate, rows.rate * posed.v_rate),
+        conic=_shear(_conic(gaussians, posed, camera, options), moving * posed.u_rate, moving * posed.v_rate),
         opacity=gaussians.opacity_logits.sigmoid(),
         colour=_colour(gaussians.sh, posed.world, camera),
         depth=posed.local[:, 2],
@@ -146,7 +147,7 @@ def rasterise(splats: Splats, rows: TimedRows, width: int, options: Options) -> 
     strips = []
     for top in range(rows.lo, rows.hi, options.strip_rows):
         bottom = min(top + options.strip_rows, rows.hi)
-        ordered = splats.take(_depth_order(splats, rows, (top + bottom) / 2))
+        ordered = splats.take(_depth_order(splats, rows, (top + bottom) / 2, options))
         tiles = [
             _composite(ordered, (top, bottom), (left, min(left + TILE_COLUMNS, width)), options)
             for left in range(0, width, TILE_COLUMNS)
@@ -235,10 +236,10 @@ def _colour(sh: Tensor, world: Tensor, camera: Camera) -> Tensor:
     return torch.relu(colour)
 
 
-def _depth_order(splats: Splats, rows: TimedRows, middle: float) -> Tensor:
+def _depth_order(splats: Splats, rows: TimedRows, middle: float, options: Options) -> Tensor:
     """Front to back at the instant when row coordinate ``middle`` is exposed; ties in the order of the index."""
     depth = splats.depth.detach()
-    if rows.rate != 0:
+    if rows.rate != 0 and "resort" not in options.without:
         depth = depth + splats.depth_rate.detach() * (rows.rate * middle + rows.start - splats.tau.detach())
     return depth.argsort(stable=True)
 
