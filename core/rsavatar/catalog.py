@@ -9,6 +9,7 @@ METHODS: dict[str, str] = {
     "rs-avatar": "rsavatar.methods.rolling:RollingShutterAvatar",
     "gauhuman": "rsavatar.methods.oblivious:ShutterObliviousAvatar",
     "mad-avatar": "rsavatar.methods.blur:BlurAvatar",
+    "oracle": "rsavatar.methods.oracle:Oracle",
 }
 
 MOTIONS: dict[str, str] = {
@@ -32,6 +33,7 @@ DESCRIPTIONS: dict[str, str] = {
     "rs-avatar": "rolling-shutter model: every row rendered at its own instant (ours)",
     "gauhuman": "shutter-oblivious: one pose per frame, as if the frame were instantaneous",
     "mad-avatar": "blur model: the same spline and the same T renders, averaged instead of selected",
+    "oracle": "the ceiling: trained with the true motion; needs a subject that has one",
 }
 
 

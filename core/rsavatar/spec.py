@@ -26,6 +26,7 @@ FLAGS_OF_METHOD: dict[str, frozenset[str]] = {  # the components that a method h
     "rs-avatar": frozenset({"no_rs", "no_spline", "no_pose_deformation", "no_lbs_refinement", "no_reg"}),
     "mad-avatar": frozenset({"no_spline", "no_pose_deformation", "no_lbs_refinement", "no_reg"}),
     "gauhuman": frozenset({"no_pose_deformation", "no_lbs_refinement"}),
+    "oracle": frozenset({"no_lbs_refinement"}),
 }
 
 

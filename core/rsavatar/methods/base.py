@@ -13,7 +13,7 @@ from rsavatar.avatar.density import DensityRules
 from rsavatar.avatar.networks import PoseResidual, SkinOffset
 from rsavatar.avatar.surface import Surface
 from rsavatar.body.base import BodyModel
-from rsavatar.data.base import Bytes, Subject
+from rsavatar.data.base import BodyFit, Bytes, Subject
 from rsavatar.errors import DataError, SpecError, expected
 from rsavatar.imaging import Actor, plan
 from rsavatar.motion.base import AbstractMotion, InitialMotion
@@ -57,6 +57,10 @@ class AbstractMethod(ABC):
     def motion(self, case: Case) -> AbstractMotion:
         """Pose as a function of time."""
 
+    def initial_fit(self, case: Case) -> BodyFit:
+        """Where the body's shape starts, and the poses that its pose blend shapes are taken at."""
+        return case.subject.fit
+
     @abstractmethod
     def shutter(self, case: Case) -> AbstractShutter:
         """How a training frame is exposed, as this method believes."""
@@ -79,13 +83,14 @@ def check_case(case: Case) -> None:
 def build_actor(method: AbstractMethod, case: Case) -> Actor:
     """The avatar at its start: Gaussians on the body's vertices, moving as the initial fit says."""
     torch.manual_seed(case.spec.seed)  # the networks' initial weights
-    fit, lost = case.subject.fit, case.spec.ablation
+    fit, lost = method.initial_fit(case), case.spec.ablation
     surface = Surface(case.body, fit.shapes)
+    motion = method.motion(case)
     return Actor(
         Avatar(surface),
-        method.motion(case),
+        motion,
         surface.pose_offsets(fit.poses),
-        None if lost.no_pose_deformation else PoseResidual(),
+        None if lost.no_pose_deformation or not list(motion.parameters()) else PoseResidual(),
         None if lost.no_lbs_refinement else SkinOffset(),
     )
 
