@@ -83,7 +83,7 @@ def backlog(app: Celery) -> int:
         kombu.exceptions.OperationalError, redis.RedisError, OSError: if the broker is away.
     """
     with app.connection_for_write() as connection:
-        connection.ensure_connection(max_retries=1)
+        connection.ensure_connection(max_retries=1, interval_start=0.1)
         return int(Queue(QUEUE)(connection.default_channel).queue_declare(passive=False).message_count)
 
 

@@ -100,6 +100,19 @@ def client(settings: Settings, store: Store) -> Iterator[httpx.Client]:
         yield client
 
 
+@pytest.fixture(scope="session")
+def untouched(tmp_path_factory: pytest.TempPathFactory, broker: str) -> Iterator[httpx.Client]:
+    """One application for all tests whose requests are refused or only look."""
+    settings = Settings(home=tmp_path_factory.mktemp("untouched"), broker_url=broker)
+    make_home(settings)
+    store = Store(settings)
+    schema.migrate(store)
+    store.close()
+    with serving(settings) as client:
+        yield client
+        assert client.get("/api/v1/jobs").json()["items"] == []
+
+
 def submission(spec_sha256: str = "a" * 64, key: str | None = None, request: str = "r", **spec: object) -> Submission:
     return Submission({**SPEC, **spec}, spec_sha256, request, max_attempts=3, idempotency_key=key)
 

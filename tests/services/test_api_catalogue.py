@@ -22,16 +22,16 @@ def subject(tmp_path: Path) -> Path:
     return folder
 
 
-def test_catalogue(client: httpx.Client) -> None:
-    methods = client.get("/api/v1/methods").json()
+def test_catalogue(untouched: httpx.Client) -> None:
+    methods = untouched.get("/api/v1/methods").json()
     assert [m["name"] for m in methods] == list(METHODS)
     assert all(m["description"] for m in methods)
-    assert {"smoke", "draft", "paper"} <= set(client.get("/api/v1/presets").json())
-    assert "lambda" in client.get("/api/v1/spec/schema").json()["properties"]
+    assert {"smoke", "draft", "paper"} <= set(untouched.get("/api/v1/presets").json())
+    assert "lambda" in untouched.get("/api/v1/spec/schema").json()["properties"]
 
 
-def test_openapi_shows_the_spec_as_the_body_of_a_submission(client: httpx.Client) -> None:
-    document = client.get("/api/v1/openapi.json").json()
+def test_openapi_shows_the_spec_as_the_body_of_a_submission(untouched: httpx.Client) -> None:
+    document = untouched.get("/api/v1/openapi.json").json()
     body = document["components"]["schemas"]["JobRequest"]
     assert body["required"] == ["method", "subject"]
     assert body["additionalProperties"] is False
@@ -50,8 +50,8 @@ def test_an_operator_registers_a_directory(client: httpx.Client, subject: Path) 
 
 
 @pytest.mark.parametrize("path", ["relative", "/nowhere/at/all", "/", "/etc/passwd", "/etc\0/x"])
-def test_what_is_no_subject_is_refused(client: httpx.Client, path: str) -> None:
-    reply = client.post("/api/v1/subjects", json={"name": "x", "path": path})
+def test_what_is_no_subject_is_refused(untouched: httpx.Client, path: str) -> None:
+    reply = untouched.post("/api/v1/subjects", json={"name": "x", "path": path})
     assert (reply.status_code, reply.json()["errors"][0]["name"]) == (422, "path")
 
 
@@ -121,7 +121,7 @@ def test_pages_show_jobs_results_and_no_inline_code(client: httpx.Client, store:
     assert client.get("/jobs/00000000-0000-7000-8000-000000000000").status_code == 404
 
 
-def test_static_files_name_no_other_site(client: httpx.Client) -> None:
+def test_static_files_name_no_other_site(untouched: httpx.Client) -> None:
     for name in ("style.css", "live.js", "icon.svg"):
-        text = client.get(f"/static/{name}").text.replace("http://www.w3.org/2000/svg", "")
+        text = untouched.get(f"/static/{name}").text.replace("http://www.w3.org/2000/svg", "")
         assert "//" not in text.replace("// ", "")

@@ -12,14 +12,14 @@ from tests.services.test_api_jobs import REQUEST
 
 
 @pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example:8000", "user@127.0.0.1", "", "ü"])
-def test_a_foreign_name_of_this_host_is_refused(client: httpx.Client, host: str) -> None:
-    reply = client.get("/api/v1/jobs", headers={"host": host.encode()})
+def test_a_foreign_name_of_this_host_is_refused(untouched: httpx.Client, host: str) -> None:
+    reply = untouched.get("/api/v1/jobs", headers={"host": host.encode()})
     assert reply.status_code in {400, 421}
 
 
 @pytest.mark.parametrize("host", ["localhost", "localhost:99", "127.0.0.1", "[::1]:8000"])
-def test_names_of_loopback_are_ours(client: httpx.Client, host: str) -> None:
-    assert client.get("/healthz", headers={"host": host}).status_code == 200
+def test_names_of_loopback_are_ours(untouched: httpx.Client, host: str) -> None:
+    assert untouched.get("/healthz", headers={"host": host}).status_code == 200
 
 
 def test_another_site_cannot_submit(client: httpx.Client) -> None:
@@ -30,8 +30,8 @@ def test_another_site_cannot_submit(client: httpx.Client) -> None:
     assert client.post("/api/v1/jobs", json=REQUEST, headers={"origin": own}).status_code == 202
 
 
-def test_a_form_of_another_site_is_no_json(client: httpx.Client) -> None:
-    reply = client.post("/api/v1/jobs", content=b'{"method":"gauhuman","subject":"studio"}')
+def test_a_form_of_another_site_is_no_json(untouched: httpx.Client) -> None:
+    reply = untouched.post("/api/v1/jobs", content=b'{"method":"gauhuman","subject":"studio"}')
     assert reply.status_code == 422
 
 
@@ -48,16 +48,16 @@ def test_large_bodies_are_refused_with_and_without_a_length(client: httpx.Client
 
 
 @pytest.mark.parametrize("path", ["/", "/api/v1/jobs", "/healthz", "/static/style.css", "/nowhere"])
-def test_every_reply_carries_the_headers(client: httpx.Client, path: str) -> None:
-    headers = client.get(path).headers
+def test_every_reply_carries_the_headers(untouched: httpx.Client, path: str) -> None:
+    headers = untouched.get(path).headers
     assert "default-src 'none'" in headers["content-security-policy"]
     assert headers["x-content-type-options"] == "nosniff"
     assert headers["cross-origin-resource-policy"] == "same-origin"
     assert "server" not in headers or "uvicorn" in headers["server"]
 
 
-def test_unknown_paths_and_verbs_are_problems(client: httpx.Client) -> None:
-    for reply, status in ((client.get("/nowhere"), 404), (client.delete("/api/v1/jobs"), 405)):
+def test_unknown_paths_and_verbs_are_problems(untouched: httpx.Client) -> None:
+    for reply, status in ((untouched.get("/nowhere"), 404), (untouched.delete("/api/v1/jobs"), 405)):
         assert (reply.status_code, reply.json()["status"]) == (status, status)
         assert reply.headers["content-type"] == "application/problem+json"
 

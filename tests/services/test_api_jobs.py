@@ -65,19 +65,19 @@ def test_a_repeated_key_repeats_nothing(client: httpx.Client) -> None:
         ({"iterations": "many"}, "iterations"),
     ],
 )
-def test_a_refusal_names_what_was_wrong(client: httpx.Client, changes: dict[str, object], name: str) -> None:
-    reply = post(client, **changes)
+def test_a_refusal_names_what_was_wrong(untouched: httpx.Client, changes: dict[str, object], name: str) -> None:
+    reply = post(untouched, **changes)
     assert reply.status_code == 422
     assert reply.headers["content-type"] == "application/problem+json"
     problem = reply.json()
     assert problem["errors"][0]["name"].split(".")[0] == name, problem
     assert problem["errors"][0]["expected"]
-    assert client.get("/api/v1/jobs").json()["items"] == []
+    assert untouched.get("/api/v1/jobs").json()["items"] == []
 
 
 @pytest.mark.parametrize("body", [b"", b"[]", b"nul", b'{"a":', b'"text"', b"\xff\xfe"])
-def test_a_body_that_is_no_object_is_refused(client: httpx.Client, body: bytes) -> None:
-    reply = client.post("/api/v1/jobs", content=body, headers={"content-type": "application/json"})
+def test_a_body_that_is_no_object_is_refused(untouched: httpx.Client, body: bytes) -> None:
+    reply = untouched.post("/api/v1/jobs", content=body, headers={"content-type": "application/json"})
     assert reply.status_code in {400, 422}
     assert reply.headers["content-type"] == "application/problem+json"
 
@@ -106,9 +106,9 @@ def test_verbs_and_their_refusals(client: httpx.Client) -> None:
 
 
 @pytest.mark.parametrize("place", ["", "/metrics", "/results", "/artifacts", "/log", "/events"])
-def test_an_unknown_job_is_unknown_everywhere(client: httpx.Client, place: str) -> None:
-    assert client.get(f"/api/v1/jobs/{UNKNOWN}{place}").status_code == 404
-    assert client.get(f"/api/v1/jobs/1{place}").status_code == 422
+def test_an_unknown_job_is_unknown_everywhere(untouched: httpx.Client, place: str) -> None:
+    assert untouched.get(f"/api/v1/jobs/{UNKNOWN}{place}").status_code == 404
+    assert untouched.get(f"/api/v1/jobs/1{place}").status_code == 422
 
 
 def test_results_curves_and_log(client: httpx.Client, store: Store, settings: Settings) -> None:
