@@ -141,10 +141,10 @@ def print_table(main: dict[str, Any], console: Console) -> None:
     shown = [
         c for c in main["columns"] if c["key"] not in HIDDEN and any(row[c["key"]] is not None for row in main["rows"])
     ]
-    table = Table(box=SIMPLE, padding=(0, 1), pad_edge=False)
+    table = Table(box=SIMPLE, padding=(0, 1, 0, 0), pad_edge=False)
     for column in shown:
         is_name = column["key"] == "method"
-        table.add_column(column["title"], justify="left" if is_name else "right", no_wrap=is_name)
+        table.add_column(column["title"], justify="left" if is_name else "right", no_wrap=is_name, overflow="fold")
     for row in main["rows"]:
         table.add_row(*(text_of(row[column["key"]]) for column in shown))
     console.print(table)
