@@ -48,7 +48,7 @@ static void cull(const RsFrame &frame, Slot &slot, int count, const Projected &p
 static Splat pack(const RsFrame &frame, const Slot &slot, const Projected &p, int survivor) {
     int i = slot.ids[survivor];
     Splat s;
-    s.u = p(U, i), s.v = p(V, i), s.qxx = p(QXX, i), s.qxy = p(QXY, i), s.qyy = p(QYY, i), s.log2_opacity = p(LOG2_OPACITY, i);
+    s.u = p(U, i), s.v = p(V, i), s.qxx = p(QXX, i), s.tilt = p(TILT, i), s.qyy = p(QYY, i), s.log2_opacity = p(LOG2_OPACITY, i);
     s.r = p(RED, i), s.g = p(GREEN, i), s.b = p(BLUE, i);
     s.depth = p(DEPTH, i), s.depth_rate = p(DEPTH_RATE, i), s.tau = p(TAU, i), s.survivor = survivor;
     float hx = p(HALF_X, i), hy = p(HALF_Y, i);

@@ -8,7 +8,7 @@
 // A projected Gaussian, packed for the rasteriser: one cache line.
 struct alignas(64) Splat {
     float u, v;                        // mean, pixels
-    float qxx, qxy, qyy;               // log2 alpha = qxx dx^2 + qxy dx dy + qyy dy^2 + log2_opacity
+    float qxx, tilt, qyy;              // log2 alpha = qxx (dx + tilt dy)^2 + qyy dy^2 + log2_opacity; qxx, qyy <= 0
     float log2_opacity;
     float r, g, b;
     int16_t x_lo, x_hi, y_lo, y_hi;    // where alpha >= alpha_min can hold, clipped to the slot and the image
@@ -17,11 +17,12 @@ struct alignas(64) Splat {
 };
 static_assert(sizeof(Splat) == 64, "one cache line");
 
-// Gradient of one splat; the sums over pixels that everything else follows from. g = dL/dalpha * alpha at a pixel.
+// Gradient of one splat; the sums over pixels that everything else follows from. g = dL/dalpha * alpha at a pixel, its
+// coordinates x = dx + tilt dy and y = dy.
 enum Moment { M0, MX, MY, MXX, MXY, MYY, MR, MG, MB, MOMENTS };
 
 // Projected Gaussians of one slot before culling, structure of arrays [FIELDS][stride].
-enum Field { U, V, QXX, QXY, QYY, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH, DEPTH_RATE, TAU, HALF_X, HALF_Y, FIELDS };
+enum Field { U, V, QXX, TILT, QYY, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH, DEPTH_RATE, TAU, HALF_X, HALF_Y, FIELDS };
 
 struct Slot {
     RsRows rows;

@@ -123,7 +123,9 @@ struct Footprint {
     Vec3 g0, g1;               // rows of the projection's Jacobian in the world, J R_cam
     Vec3 k0, k1;               // rows of K = J R_cam M; Sigma = K K^T + dilation I
     Floats sxx, sxy, syy;      // Sigma
-    Floats A, B, C;            // Sigma^-1 = [A B; B C]
+    // d^T Sigma^-1 d = A (dx - r dy)^2 + dy^2 / syy: a sum of squares, where A dx^2 + 2 B dx dy + C dy^2 of a needle
+    // cancels. r = sxy / syy; A = syy / det(Sigma).
+    Floats A, r, inverse_syy;
     Floats jx, jy, jxz, jyz;   // fx/Z, fy/Z, -fx X/Z^2, -fy Y/Z^2
 };
 
@@ -156,7 +158,8 @@ static inline void footprint(const Block &block, const RsGaussians &g, const Pos
     // ac - b^2 cancels on needles; |k0 x k1|^2 + eps tr + eps^2 does not, and is never negative
     Vec3 n = cross(f.k0, f.k1);
     Floats inverse = 1.f / (dot(n, n) + eps * (f.sxx + f.syy - eps));
-    f.A = f.syy * inverse, f.B = -f.sxy * inverse, f.C = f.sxx * inverse;
+    f.inverse_syy = 1.f / f.syy;
+    f.A = f.syy * inverse, f.r = f.sxy * f.inverse_syy;
 }
 
 // Real spherical harmonics of degree <= 1 in direction d (3D Gaussian splatting's signs).

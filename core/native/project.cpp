@@ -58,14 +58,14 @@ static void project_block(const RsFrame &frame, const RsGaussians &g, const floa
     // Within the footprint the mean moves (a, b) pixels per row: the conic is sheared, and so is its box.
     float moving = o.flags & RS_NO_SHEAR ? 0.f : slot.rows.rate;
     Floats a = p.ud * moving, slack = scan_slack(moving, p.vd), shear = a / slack;
-    Floats A = f.A, B = slack * f.B - a * f.A, C = a * a * f.A - 2.f * a * slack * f.B + slack * slack * f.C;
     Floats reach = maximum((log2_opacity - log2(splat(o.alpha_min))) * (2.f / LOG2_E) * 1.0001f + 1e-4f, Floats{});
     Floats half_x = square_root(reach * maximum(f.sxx + 2.f * shear * f.sxy + shear * shear * f.syy, Floats{}));
     Floats half_y = square_root(reach * f.syy) / maximum(slack, -slack);
 
     Floats out[FIELDS];
     out[U] = p.u + block.get(g.screen), out[V] = p.v + block.get(g.screen + g.count);
-    out[QXX] = A * (-0.5f * LOG2_E), out[QXY] = B * -LOG2_E, out[QYY] = C * (-0.5f * LOG2_E);
+    out[QXX] = f.A * (-0.5f * LOG2_E), out[TILT] = -(slack * f.r + a);
+    out[QYY] = slack * slack * f.inverse_syy * (-0.5f * LOG2_E);
     out[LOG2_OPACITY] = log2_opacity;
     for (int k = 0; k < 3; k++) out[RED + k] = maximum(s.colour[k], Floats{});
     out[DEPTH] = select(p.in_front, p.camera.z, splat(-1.f)), out[DEPTH_RATE] = p.velocity.z, out[TAU] = tau;
@@ -84,7 +84,7 @@ void project(RsFrame &frame, const RsGaussians &g, const float *pose, int index,
 
 // Gradients of what the rasteriser saw: from moments of g = dL/dalpha * alpha over the splat's pixels.
 struct SplatGradient {
-    Floats u, v, A, B, C, logit, colour[3];
+    Floats u, v, A, tilt, S, logit, colour[3];  // log alpha = -(A (dx + tilt dy)^2 + S dy^2) / 2
 };
 
 // Sums the moments of a splat's strips, in order, for LANES survivors of a slot.
@@ -102,11 +102,10 @@ static bool gather_moments(const Slot &slot, int first, int count, float out[MOM
     return seen;
 }
 
-static SplatGradient splat_gradient(const float m[MOMENTS][LANES], Floats A, Floats B, Floats C, Floats opacity) {
+static SplatGradient splat_gradient(const float m[MOMENTS][LANES], Floats A, Floats tilt, Floats S, Floats opacity) {
     SplatGradient s;
-    Floats mx = load(m[MX]), my = load(m[MY]);
-    s.u = A * mx + B * my, s.v = B * mx + C * my;
-    s.A = load(m[MXX]) * -0.5f, s.B = -load(m[MXY]), s.C = load(m[MYY]) * -0.5f;
+    s.u = A * load(m[MX]), s.v = tilt * s.u + S * load(m[MY]);
+    s.A = load(m[MXX]) * -0.5f, s.tilt = -A * load(m[MXY]), s.S = load(m[MYY]) * -0.5f;
     s.logit = load(m[M0]) * (1.f - opacity);
     for (int k = 0; k < 3; k++) s.colour[k] = load(m[MR + k]);
     return s;
@@ -121,19 +120,14 @@ struct PosedGradient {
 
 // Through the shear (a, slack), the conic, the projected covariance and the projection.
 static PosedGradient through_projection(SplatGradient s, const Posed &p, const Footprint &f, const RsCamera &cam, float rate) {
-    Floats gud = {}, gvd = {};
-    if (rate != 0.f) {  // A' = A, B' = slack B - a A, C' = a^2 A - 2 a slack B + slack^2 C
-        Floats a = p.ud * rate, slack = scan_slack(rate, p.vd);
-        gud = (2.f * (a * f.A - slack * f.B) * s.C - f.A * s.B) * rate;
-        gvd = -(f.B * s.B + 2.f * (slack * f.C - a * f.B) * s.C) * rate;
-        s.A += a * a * s.C - a * s.B;
-        s.B = slack * s.B - 2.f * a * slack * s.C;
-        s.C = slack * slack * s.C;
-    }
-    // dSigma = -Q dQ Q with Q = [A B; B C], gradient of B shared by both off-diagonals
-    Floats h = 0.5f * s.B, t00 = s.A * f.A + h * f.B, t01 = s.A * f.B + h * f.C, t10 = h * f.A + s.C * f.B, t11 = h * f.B + s.C * f.C;
-    Floats v00 = -(f.A * t00 + f.B * t10), v01 = -(f.A * t01 + f.B * t11), v11 = -(f.B * t01 + f.C * t11);
-    Vec3 gk0 = (f.k0 * v00 + f.k1 * v01) * splat(2.f), gk1 = (f.k0 * v01 + f.k1 * v11) * splat(2.f);
+    // tilt = -(slack r + a), S = slack^2 / syy, a = rate ud, slack = 1 - rate vd
+    Floats slack = scan_slack(rate, p.vd), gr = -slack * s.tilt, gS = slack * slack * s.S;
+    Floats gud = s.tilt * -rate, gvd = (f.r * s.tilt - 2.f * slack * f.inverse_syy * s.S) * rate;
+    // dr = (dsxy - r dsyy) / syy, d(1/A) = dsxx - 2 r dsxy + r^2 dsyy, gathered around e = k0 - r k1, which is small on needles
+    Vec3 e = f.k0 - f.k1 * f.r;
+    Floats of_e = -2.f * f.A * f.A * s.A, of_r = gr * f.inverse_syy;
+    Vec3 gk0 = e * of_e + f.k1 * of_r;
+    Vec3 gk1 = e * (of_r - f.r * of_e) - f.k1 * (f.r * of_r + 2.f * gS * f.inverse_syy * f.inverse_syy);
     PosedGradient out;
     const Floats *a0 = &f.g0.x, *a1 = &f.g1.x;
     for (int i = 0; i < 3; i++) out.M.r[i] = gk0 * a0[i] + gk1 * a1[i];
@@ -265,8 +259,7 @@ static void backward_block(const RsFrame &frame, const RsGaussians &g, const RsG
     int flags = frame.options.flags;
     float moving = flags & RS_NO_SHEAR ? 0.f : rate;
     Floats a = p.ud * moving, slack = scan_slack(moving, p.vd);
-    SplatGradient sg = splat_gradient(moments, f.A, slack * f.B - a * f.A,
-                                      a * a * f.A - 2.f * a * slack * f.B + slack * slack * f.C, opacity);
+    SplatGradient sg = splat_gradient(moments, f.A, -(slack * f.r + a), slack * slack * f.inverse_syy, opacity);
     if (out.opacity_logits) block.add(out.opacity_logits, sg.logit);
     if (out.screen) block.add(out.screen, sg.u), block.add(out.screen + g.count, sg.v);
     PosedGradient pg = through_projection(sg, p, f, cam, moving);

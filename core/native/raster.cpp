@@ -75,12 +75,12 @@ static void blend_strip(const RsFrame &frame, const Slot &slot, int strip, const
         const Splat &s = slot.splats[slot.entry_splat[e]];
         int y0 = std::max<int>(c.r0, s.y_lo), y1 = std::min<int>(c.r1, s.y_hi);
         for (int y = y0; y < y1; y++) {
-            float dy = y + 0.5f - s.v, linear = s.qxy * dy, constant = s.qyy * dy * dy + s.log2_opacity;
+            float dy = y + 0.5f - s.v, ridge = s.u - s.tilt * dy, constant = s.qyy * dy * dy + s.log2_opacity;
             for (int x = s.x_lo; x < s.x_hi; x += LANES) {
-                Floats dx = CENTRES + (x - s.u);
+                Floats dx = CENTRES + (x - ridge);
                 Hit hit;
                 float *t = c.at(y, x);
-                if (!step((dx * s.qxx + linear) * dx + constant, t, limits, hit)) continue;
+                if (!step(dx * dx * s.qxx + constant, t, limits, hit)) continue;
                 store(t + R_PLANE * c.plane, load(t + R_PLANE * c.plane) + hit.weight * s.r);
                 store(t + G_PLANE * c.plane, load(t + G_PLANE * c.plane) + hit.weight * s.g);
                 store(t + B_PLANE * c.plane, load(t + B_PLANE * c.plane) + hit.weight * s.b);
@@ -155,13 +155,13 @@ static void splat_moments(const Splat &s, const Canvas &c, const Limits &limits,
     Floats m0 = {}, mx = {}, my = {}, mxx = {}, mxy = {}, myy = {}, mr = {}, mg = {}, mb = {};
     int y0 = std::max<int>(c.r0, s.y_lo), y1 = std::min<int>(c.r1, s.y_hi);
     for (int y = y0; y < y1; y++) {
-        float dy = y + 0.5f - s.v, linear = s.qxy * dy, constant = s.qyy * dy * dy + s.log2_opacity;
+        float dy = y + 0.5f - s.v, ridge = s.u - s.tilt * dy, constant = s.qyy * dy * dy + s.log2_opacity;
         Floats row0 = {}, rowx = {};
         for (int x = s.x_lo; x < s.x_hi; x += LANES) {
-            Floats dx = CENTRES + (x - s.u);
+            Floats dx = CENTRES + (x - ridge);
             Hit hit;
             float *t = c.at(y, x);
-            if (!step((dx * s.qxx + linear) * dx + constant, t, limits, hit)) continue;
+            if (!step(dx * dx * s.qxx + constant, t, limits, hit)) continue;
             Floats gr = load(t + GR_PLANE * c.plane), gg = load(t + GG_PLANE * c.plane), gb = load(t + GB_PLANE * c.plane);
             Floats shade = gr * s.r + gg * s.g + gb * s.b, rest = load(t + REST_PLANE * c.plane) - hit.weight * shade;
             store(t + REST_PLANE * c.plane, rest);
