@@ -1,0 +1,1 @@
+"""Benchmarks: each module of the same name as its word, ``rsavatar bench WORD``."""
