@@ -10,13 +10,15 @@ int rs_lanes(void) { return LANES; }
 
 static bool same_rows(const RsRows &a, const RsRows &b) { return a.lo == b.lo && a.hi == b.hi; }
 
-// Lays out slots, groups and strips. False if a row range is outside the image or partly overlaps another.
+// Lays out slots, groups and strips. False if a row range is outside the image or partly overlaps another, or a number of
+// it is not finite.
 static bool plan(RsFrame &frame, const RsRows *rows, int slots, int count) {
     int next = 0, height = frame.options.strip_rows;
     frame.slot_count = slots, frame.groups.clear(), frame.tasks.clear();
     if ((int)frame.slots.size() < slots) frame.slots.resize(slots);
     for (int t = 0; t < slots; t++) {
         Slot &slot = frame.slots[t];
+        if (!std::isfinite(rows[t].rate) || !std::isfinite(rows[t].start) || !std::isfinite(rows[t].weight)) return false;
         slot.rows = rows[t], slot.strips = (rows[t].hi - rows[t].lo + height - 1) / height;
         if (t && same_rows(rows[t], rows[t - 1])) {
             frame.groups.back().slots++;
@@ -55,8 +57,10 @@ static void project_and_bin(RsFrame &frame, const RsGaussians &g, const float *p
         for (int begin = 0; begin < M; begin += CHUNK) project(frame, g, pose, 0, begin, std::min(begin + CHUNK, M));
         return bin(frame, 0, M);
     }
+    Attempt attempt;
 #pragma omp parallel for schedule(dynamic, 1) num_threads(threads)
-    for (int t = 0; t < T; t++) project(frame, g, pose, t, 0, M), bin(frame, t, M);
+    for (int t = 0; t < T; t++) attempt([&, t] { project(frame, g, pose, t, 0, M), bin(frame, t, M); });
+    attempt.settle();
 }
 
 static bool acceptable(const RsGaussians &g, int slots, int coefficients, const RsCamera &camera, const RsOptions &options) {
@@ -74,7 +78,7 @@ int rs_render(RsFrame *frame, const RsGaussians *g, const float *pose, int slots
     clear_uncovered(*frame, rgb, transmittance);
     raster(*frame, rgb, transmittance);
     *counters = {};
-    for (int t = 0; t < slots; t++) counters->splats += frame->slots[t].ids.size(), counters->pairs += frame->slots[t].entry_pair.size();
+    for (int t = 0; t < slots; t++) counters->splats += frame->slots[t].ids.size(), counters->pairs += frame->slots[t].entry_pair.size(), counters->broken += frame->slots[t].broken;
     return 0;
 } catch (const std::bad_alloc &) {
     return 1;

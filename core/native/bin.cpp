@@ -32,10 +32,12 @@ static int16_t first_centre(float edge, int lo, int hi) { return (int16_t)std::c
 static void cull(const RsFrame &frame, Slot &slot, int count, const Projected &p) {
     const RsRows &rows = slot.rows;
     float cut = std::log2(frame.options.alpha_min);
+    slot.broken = 0;
     slot.ids.clear(), slot.tau.clear(), slot.keys.clear(), slot.order.clear();
     for (int i = 0; i < count; i++) {
         float u = p(U, i), v = p(V, i), hx = p(HALF_X, i), hy = p(HALF_Y, i), depth = p(DEPTH, i);
-        bool visible = (depth > 0.f) & (p(LOG2_OPACITY, i) > cut) & (v + hy > rows.lo) & (v - hy < rows.hi) & (u + hx > 0.f) &
+        slot.broken += depth == BROKEN;
+        bool visible = (depth > 0.f) & (p(LOG2_OPACITY, i) > cut) & (p(QXX, i) <= 0.f) & (v + hy > rows.lo) & (v - hy < rows.hi) & (u + hx > 0.f) &
                        (u - hx < frame.camera.width);
         if (!visible) continue;
         uint32_t key;
@@ -57,8 +59,21 @@ static Splat pack(const RsFrame &frame, const Slot &slot, const Projected &p, in
     return s;
 }
 
+constexpr int64_t MOST_MOVES = 64;  // per splat; merging costs about as much
+
+static void merge(const std::vector<float> &key, int32_t *entry, int32_t *pair) {
+    struct Entry {
+        float key;
+        int32_t splat, pair;
+    };
+    std::vector<Entry> all(key.size());
+    for (size_t i = 0; i < all.size(); i++) all[i] = {key[i], entry[i], pair[i]};
+    std::stable_sort(all.begin(), all.end(), [](const Entry &a, const Entry &b) { return a.key < b.key; });
+    for (size_t i = 0; i < all.size(); i++) entry[i] = all[i].splat, pair[i] = all[i].pair;
+}
+
 // Within the strip, depth is z + dz/dtau (tau of the strip's middle - own tau): nearly the order that is there already,
-// so insertion sort, which is stable.
+// so insertion sort, which is stable; where it is not (splats that fly past each other), a merge sort goes on from there.
 static void resort(const RsFrame &frame, Slot &slot, int strip) {
     int r0 = slot.rows.lo + strip * frame.options.strip_rows, r1 = std::min(r0 + frame.options.strip_rows, slot.rows.hi);
     float tau = slot.rows.rate * 0.5f * (r0 + r1) + slot.rows.start;
@@ -68,12 +83,18 @@ static void resort(const RsFrame &frame, Slot &slot, int strip) {
     key.resize(n);
     for (int i = 0; i < n; i++) {
         const Splat &s = slot.splats[entry[i]];
-        float k = s.depth + s.depth_rate * (tau - s.tau);
+        key[i] = s.depth + s.depth_rate * (tau - s.tau);
+    }
+    int64_t moves = 0;
+    for (int i = 0; i < n && moves <= MOST_MOVES * n; i++) {
+        float k = key[i];
         int32_t e = entry[i], q = pair[i];
         int j = i;
         for (; j > 0 && key[j - 1] > k; j--) key[j] = key[j - 1], entry[j] = entry[j - 1], pair[j] = pair[j - 1];
         key[j] = k, entry[j] = e, pair[j] = q;
+        moves += i - j;
     }
+    if (moves > MOST_MOVES * n) merge(key, entry, pair);
 }
 
 void bin(RsFrame &frame, int index, int count) {
@@ -84,13 +105,14 @@ void bin(RsFrame &frame, int index, int count) {
     int n = slot.ids.size(), lo = slot.rows.lo, height = frame.options.strip_rows;
     slot.splats.resize(n), slot.rank.resize(n), slot.first_pair.resize(n + 1);
     slot.strip_begin.assign(slot.strips + 1, 0);
-    int pairs = 0;
+    int64_t pairs = 0;
     for (int k = 0; k < n; k++) {
         const Splat s = slot.splats[k] = pack(frame, slot, p, slot.order[k]);
         slot.rank[slot.order[k]] = k, slot.first_pair[k] = pairs;
         if (s.y_lo >= s.y_hi || s.x_lo >= s.x_hi) continue;
         for (int strip = (s.y_lo - lo) / height; strip <= (s.y_hi - 1 - lo) / height; strip++) slot.strip_begin[strip + 1]++, pairs++;
     }
+    if (pairs > INT32_MAX) throw std::bad_alloc();  // 128 GiB of moments
     slot.first_pair[n] = pairs;
     for (int strip = 0; strip < slot.strips; strip++) slot.strip_begin[strip + 1] += slot.strip_begin[strip];
     slot.entry_splat.resize(pairs), slot.entry_pair.resize(pairs);

@@ -1,5 +1,7 @@
 // One image's plan, as the stages hand it on: project -> bin -> raster, and back.
 #pragma once
+#include <atomic>
+#include <new>
 #include <vector>
 
 #include "layout.h"
@@ -24,9 +26,12 @@ enum Moment { M0, MX, MY, MXX, MXY, MYY, MR, MG, MB, MOMENTS };
 // Projected Gaussians of one slot before culling, structure of arrays [FIELDS][stride].
 enum Field { U, V, QXX, TILT, QYY, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH, DEPTH_RATE, TAU, HALF_X, HALF_Y, FIELDS };
 
+constexpr float BEHIND = -1.f, BROKEN = -2.f;  // in place of a depth
+
 struct Slot {
     RsRows rows;
     int strips;
+    int broken;                        // Gaussians left out because a number of theirs is not finite
     std::vector<int32_t> ids;          // surviving Gaussians, ascending
     std::vector<float> tau;            // of the survivors
     std::vector<int32_t> rank;         // survivor -> its splat
@@ -61,6 +66,23 @@ void raster(RsFrame &frame, float *rgb, float *transmittance);
 void raster_backward(RsFrame &frame, const float *rgb, const float *transmittance, const float *grad_rgb,
                      const float *grad_transmittance);
 void project_backward(RsFrame &frame, const RsGaussians &gaussians, const float *pose, const RsGradients &gradients);
+
+// Runs work within a parallel region, which no exception may leave: that memory ran out is noted, and thrown after it.
+class Attempt {
+    std::atomic<bool> failed{false};
+
+public:
+    template <class Work> void operator()(Work work) {
+        try {
+            if (!failed) work();
+        } catch (const std::bad_alloc &) {
+            failed = true;
+        }
+    }
+    void settle() const {
+        if (failed) throw std::bad_alloc();
+    }
+};
 
 // Stride of the scratch arrays: whole vectors, plus one so that a block may start anywhere.
 static inline size_t padded(int count) { return ((size_t)count + 2 * LANES - 1) / LANES * LANES; }

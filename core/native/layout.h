@@ -62,6 +62,7 @@ struct RsOptions {
 struct RsCounters {
     int64_t splats;  // Gaussians that survived culling, summed over slots
     int64_t pairs;   // (splat, strip) pairs rasterised
+    int64_t broken;  // Gaussians not drawn because NaN or infinity is in them or in their pose, summed over slots
 };
 
 struct RsFrame;  // one image's plan and scratch, kept between forward and backward and reused between images

@@ -37,6 +37,15 @@ static void opacity_of(Floats logit, Floats &opacity, Floats &log2_opacity) {
     log2_opacity = log2(opacity);
 }
 
+// Where every number that a Gaussian consists of, its pose's among them, is finite: 0 times anything else is not 0.
+static Ints finite(const Block &block, const RsGaussians &g, const Posed &p, const Footprint &f, const Shading &s) {
+    size_t M = g.count;
+    Floats all = p.world.x + p.world.y + p.world.z + p.velocity.x + p.velocity.y + p.velocity.z + block.get(g.opacity_logits);
+    for (int i = 0; i < 4; i++) all += f.q[i];
+    for (int i = 0; i < 3; i++) all += block.get(g.log_scales + i * M) + s.colour[i];
+    return (all + block.get(g.screen) + block.get(g.screen + M)) * 0.f == 0.f;
+}
+
 static void project_block(const RsFrame &frame, const RsGaussians &g, const float *pose, int first, Slot &slot) {
     const RsCamera &cam = frame.camera;
     const RsOptions &o = frame.options;
@@ -68,7 +77,8 @@ static void project_block(const RsFrame &frame, const RsGaussians &g, const floa
     out[QYY] = slack * slack * f.inverse_syy * (-0.5f * LOG2_E);
     out[LOG2_OPACITY] = log2_opacity;
     for (int k = 0; k < 3; k++) out[RED + k] = maximum(s.colour[k], Floats{});
-    out[DEPTH] = select(p.in_front, p.camera.z, splat(-1.f)), out[DEPTH_RATE] = p.velocity.z, out[TAU] = tau;
+    out[DEPTH] = select(finite(block, g, p, f, s), select(p.in_front, p.camera.z, splat(BEHIND)), splat(BROKEN));
+    out[DEPTH_RATE] = p.velocity.z, out[TAU] = tau;
     out[HALF_X] = half_x, out[HALF_Y] = half_y;
     size_t stride = slot.scratch.size() / FIELDS;
     for (int k = 0; k < FIELDS; k++) store(slot.scratch.data() + k * stride + first, out[k]);
@@ -294,8 +304,9 @@ void project_backward(RsFrame &frame, const RsGaussians &g, const float *pose, c
     int D = frame.coefficients, T = frame.slot_count;
     size_t n = (size_t)D * JOINTS * 12;
     frame.pose_sums.assign(out.pose ? CHUNKS * T * n : 0, 0.f);
+    Attempt attempt;
 #pragma omp parallel for schedule(dynamic, 1) num_threads(frame.options.threads)
-    for (int chunk = 0; chunk < CHUNKS; chunk++) {
+    for (int chunk = 0; chunk < CHUNKS; chunk++) attempt([&, chunk] {
         int32_t begin = (int64_t)g.count * chunk / CHUNKS, end = (int64_t)g.count * (chunk + 1) / CHUNKS;
         std::vector<Floats> sums(n);
         for (int t = 0; t < T; t++) {
@@ -309,7 +320,8 @@ void project_backward(RsFrame &frame, const RsGaussians &g, const float *pose, c
             if (out.pose)
                 for (size_t i = 0; i < n; i++) frame.pose_sums[(chunk * (size_t)T + t) * n + i] = sum(sums[i]);
         }
-    }
+    });
+    attempt.settle();
     if (out.pose)
         for (size_t i = 0; i < T * n; i++) {
             float s = 0.f;

@@ -108,11 +108,12 @@ static void emit(const RsFrame &frame, const Canvas &c, float weight, bool first
 
 void raster(RsFrame &frame, float *rgb, float *transmittance) {
     int tasks = frame.tasks.size();
+    Attempt attempt;
 #pragma omp parallel num_threads(frame.options.threads)
     {
         static thread_local std::vector<float> buffer;
 #pragma omp for schedule(dynamic, 1)
-        for (int task = 0; task < tasks; task++) {
+        for (int task = 0; task < tasks; task++) attempt([&, task] {
             const Group &group = frame.groups[frame.tasks[task].first];
             for (int k = 0; k < group.slots; k++) {
                 const Slot &slot = frame.slots[group.first_slot + k];
@@ -120,8 +121,9 @@ void raster(RsFrame &frame, float *rgb, float *transmittance) {
                 blend_strip(frame, slot, frame.tasks[task].second, c);
                 emit(frame, c, slot.rows.weight, k == 0, rgb, transmittance);
             }
-        }
+        });
     }
+    attempt.settle();
 }
 
 // ---- backward ---------------------------------------------------------------------------------------------------------
@@ -180,11 +182,12 @@ void raster_backward(RsFrame &frame, const float *rgb, const float *transmittanc
     int tasks = frame.tasks.size();
     for (int t = 0; t < frame.slot_count; t++) frame.slots[t].moments.resize(frame.slots[t].entry_pair.size() * 16);
     const Limits limits(frame.options);
+    Attempt attempt;
 #pragma omp parallel num_threads(frame.options.threads)
     {
         static thread_local std::vector<float> forward, backward;
 #pragma omp for schedule(dynamic, 1)
-        for (int task = 0; task < tasks; task++) {
+        for (int task = 0; task < tasks; task++) attempt([&, task] {
             const Group &group = frame.groups[frame.tasks[task].first];
             int strip = frame.tasks[task].second;
             for (int k = 0; k < group.slots; k++) {
@@ -199,6 +202,7 @@ void raster_backward(RsFrame &frame, const float *rgb, const float *transmittanc
                 for (int e = slot.strip_begin[strip]; e < slot.strip_begin[strip + 1]; e++)
                     splat_moments(slot.splats[slot.entry_splat[e]], c, limits, &slot.moments[(size_t)slot.entry_pair[e] * 16]);
             }
-        }
+        });
     }
+    attempt.settle();
 }

@@ -60,12 +60,15 @@ class Rendering:
     """An image on black: ``rgb`` [3, H, W] and ``transmittance`` [H, W] (1 where nothing was hit).
 
     ``splats`` Gaussians survived culling (summed over slots) and made ``pairs`` (splat, strip) pairs; 0 = not counted.
+    ``broken`` Gaussians had NaN or infinity in them or in their pose: the kernels do not draw them and give them no
+    gradient; the twin draws what it may.
     """
 
     rgb: Tensor
     transmittance: Tensor
     splats: int = 0
     pairs: int = 0
+    broken: int = 0
 
     def over(self, background: float) -> Tensor:
         """Composited over a grey background, [3, H, W]."""

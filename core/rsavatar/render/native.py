@@ -59,7 +59,7 @@ class _Options(ctypes.Structure):
 
 
 class _Counters(ctypes.Structure):
-    _fields_ = (("splats", ctypes.c_int64), ("pairs", ctypes.c_int64))
+    _fields_ = tuple((name, ctypes.c_int64) for name in ("splats", "pairs", "broken"))
 
 
 _FLAGS = {"shear": 1, "implicit": 2, "resort": 4}
@@ -129,7 +129,7 @@ class _Render(torch.autograd.Function):
         _check(code)
         ctx.frame = frame if any(ctx.needs_input_grad) else None
         ctx.save_for_backward(*tensors, rgb, transmittance)
-        counted = torch.tensor([counters.splats, counters.pairs])
+        counted = torch.tensor([counters.splats, counters.pairs, counters.broken])
         ctx.mark_non_differentiable(counted)
         return rgb, transmittance, counted
 
@@ -170,8 +170,7 @@ def render(scene: Scene) -> Rendering:
     tensors = (*(getattr(g, name) for name in _FIELDS), scene.pose)
     _validate(g, scene.pose, scene.rows)
     rgb, transmittance, counted = _apply((scene.rows, scene.camera, scene.options), *tensors)
-    splats, pairs = counted.tolist()
-    return Rendering(rgb, transmittance, splats, pairs)
+    return Rendering(rgb, transmittance, *counted.tolist())
 
 
 _apply: Callable[..., tuple[Tensor, Tensor, Tensor]] = _Render.apply  # torch leaves apply untyped
