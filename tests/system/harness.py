@@ -31,7 +31,7 @@ QUICK: dict[str, Any] = {  # the service's protocol in fractions of a second
     "unclaimed_seconds": 0.5,
     "backoff_seconds": 0.0,
     "grace_seconds": 5.0,
-    "stall_seconds": 3.0,
+    "stall_seconds": 2.0,
     "poll_seconds": 0.05,
     "child_command": (sys.executable, "-m", "tests.system.quick_child"),
 }
@@ -42,7 +42,7 @@ def until(look: Callable[[], Found], seconds: float = PATIENCE) -> Found:
     deadline = time.monotonic() + seconds
     while not (found := look()):
         assert time.monotonic() < deadline, f"waited {seconds} s"
-        time.sleep(0.03)
+        time.sleep(0.1)
     return found
 
 
