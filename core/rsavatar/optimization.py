@@ -18,6 +18,7 @@ from rsavatar.motion.base import Continuity
 
 BLOCK = 50  # steps between refreshes of the skinning weights; all that saves state happens between blocks
 MOST_REJECTED = 50  # rejected steps in a row before training is called diverged
+FAR = 4.0  # times the best block's mean loss: diverged. Sound runs, density control included, stayed within twice
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,9 @@ class State:
         self.step = 0
         self.rejected = 0
         self.rejected_in_a_row = 0
+        self.rejected_in_block = 0
+        self.losses: list[float] = []  # of the block's accepted steps
+        self.best = math.inf  # least mean loss of a block
         self.seconds = 0.0
 
     def advance(self, actor: Actor, screen: Tensor, loss: Tensor, size: tuple[int, int]) -> None:
@@ -120,13 +124,35 @@ class State:
             self.optimizer.step()
             self.gradients.add(_grad(screen), *size)
             self.rejected_in_a_row = 0
+            self.losses.append(float(loss))
         else:
             self.rejected, self.rejected_in_a_row = self.rejected + 1, self.rejected_in_a_row + 1
+            self.rejected_in_block += 1
             if self.rejected_in_a_row >= MOST_REJECTED:
-                got = f"{MOST_REJECTED} steps in a row without: diverged"
-                raise DivergedError(expected(f"step {self.step}", "a finite loss and gradient", got))
+                problem = expected("loss and gradients", "finite numbers", f"none in {MOST_REJECTED} steps in a row")
+                raise DivergedError(f"diverged at step {self.step}: {problem}")
         self.optimizer.zero_grad(set_to_none=True)
         self.step += 1
+
+    def close_block(self, actor: Actor) -> int:
+        """Judge the block of steps that ends here, before anything of it is saved; returns how many were rejected.
+
+        Raises:
+            DivergedError: if a parameter is not finite, or the mean loss is ``FAR`` times the best block's.
+        """
+        for name, parameter in actor.named_parameters():
+            if not torch.isfinite(parameter).all():
+                raise DivergedError(
+                    f"diverged at step {self.step}: {expected(name, 'finite numbers', 'NaN or infinity')}"
+                )
+        if self.losses:
+            mean = sum(self.losses) / len(self.losses)
+            if mean > FAR * self.best:
+                wanted = f"at most {FAR:g} times the best so far, {self.best:.3g}"
+                raise DivergedError(f"diverged at step {self.step}: {expected('mean loss', wanted, f'{mean:.3g}')}")
+            self.best = min(self.best, mean)
+        rejected, self.rejected_in_block, self.losses = self.rejected_in_block, 0, []
+        return rejected
 
     def set_rates(self, settings: Settings) -> None:
         """Means and motion fall to a hundredth of their first rate, log-linearly over the run."""
@@ -159,8 +185,8 @@ def _grad(tensor: Tensor) -> Tensor:
 
 
 def _finite(loss: Tensor, screen: Tensor, actor: Actor) -> bool:
-    """Whether the loss and the gradients that everything flows through are finite."""
-    watched = [screen, actor.avatar.means, actor.avatar.log_scales, actor.shapes, *actor.motion.parameters()]
+    """Whether the loss is finite, and the gradients of what is drawn: all others come from these."""
+    watched = [screen, *actor.avatar.parameters(), actor.shapes, *actor.motion.parameters()]
     return math.isfinite(float(loss)) and all(math.isfinite(float(_grad(t).sum())) for t in watched)
 
 
@@ -183,7 +209,7 @@ class Saver:
             for i, moments in optimizer.state_dict()["state"].items():
                 tensors |= {f"{prefix}.{i}.{key}": value for key, value in moments.items()}
         tensors |= {"gradients.total": state.gradients.total, "gradients.seen": state.gradients.seen}
-        tensors["progress"] = torch.tensor([state.rejected, state.seconds], dtype=torch.float64)
+        tensors["progress"] = torch.tensor([state.rejected, state.seconds, state.best], dtype=torch.float64)
         return Checkpointed(state.step, str(self.path), checkpoint.write(self.path, tensors, self.owner, state.step))
 
     def restore(self, actor: Actor, settings: Settings) -> State:
@@ -205,7 +231,8 @@ class Saver:
                     saved["state"].setdefault(int(i), {})[key] = value
             optimizer.load_state_dict(saved)
         state.gradients.total, state.gradients.seen = tensors["gradients.total"], tensors["gradients.seen"]
-        state.rejected, state.seconds = int(tensors["progress"][0]), float(tensors["progress"][1])
+        rejected, state.seconds, state.best = tensors["progress"].tolist()
+        state.rejected = int(rejected)
         state.step = step
         return state
 

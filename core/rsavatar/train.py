@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from rsavatar.avatar.density import DensityRules, decide, prune
-from rsavatar.errors import Interrupted
+from rsavatar.errors import DivergedError, Interrupted, expected
 from rsavatar.events import Note, Progress, Report
 from rsavatar.geometry.cameras import Camera
 from rsavatar.imaging import Actor, Schedule, expose
@@ -59,7 +59,8 @@ def fit(
     refreshed, Gaussians come and go, and checkpoints are written between blocks of steps.
 
     Raises:
-        DivergedError: if many steps in a row gave no finite loss and gradient.
+        DivergedError: if many steps in a row gave no finite loss and gradient, the loss is far above its best, or no
+            Gaussians are left. The last good checkpoint is kept.
         Interrupted: if ``should_stop`` asked for it; the checkpoint is on disk.
     """
     state = saver.restore(actor, settings)
@@ -83,6 +84,8 @@ def fit(
             report(_progress(state, settings, float(loss.detach()), image, seen))
         if last or settings.closes_block(state.step):
             skin.close(state.skin_optimizer)
+            if rejected := state.close_block(actor):
+                report(Note(f"step {state.step}: {rejected} steps of this block rejected, no finite loss and gradient"))
             if settings.density and settings.density.due(state.step):
                 report(Note(_control_density(actor, state, settings, settings.density)))
             stop = not last and should_stop()
@@ -110,6 +113,8 @@ def _control_density(actor: Actor, state: State, settings: Settings, rules: Dens
     grown = actor.avatar.count
     state.edit(actor, prune(actor.avatar, actor.avatar.bind(), rules))
     actor.avatar.bind()
+    if actor.avatar.count < 2:
+        raise DivergedError(f"diverged at step {state.step}: {expected('Gaussians', '2 or more', actor.avatar.count)}")
     changes = f"{done.cloned} cloned, {done.split} split, {done.merged} merged, {grown - actor.avatar.count} pruned"
     return f"step {state.step}: {before} -> {actor.avatar.count} Gaussians ({changes})"
 

@@ -80,6 +80,6 @@ def refine(prior: Tensor, offset: Tensor) -> Tensor:
 
     A joint that the body does not bind a vertex to stays unbound, so refined weights are as sparse as the prior.
     """
-    weights = torch.softmax((prior + 1e-9).log() + offset, 0)
-    weights = torch.where((weights > LEAST_WEIGHT) & (prior > 0), weights, torch.zeros_like(weights))
+    weights = torch.softmax(prior.log() + offset, 0)  # log 0 is -inf: such joints get exactly 0
+    weights = torch.where(weights > LEAST_WEIGHT, weights, torch.zeros_like(weights))
     return weights / weights.sum(0)
