@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,28 @@ from rsavatar.errors import KernelError, expected
 
 class _Threads:
     count = 1
+    forked = False  # from a process whose OpenMP may have had threads: they are not here, and waiting for them hangs
 
 
 def use_threads(count: int) -> None:
-    """Let the kernels use ``count`` threads from now on. Results do not depend on it."""
+    """Let the kernels use ``count`` threads from now on. Results do not depend on it.
+
+    Raises:
+        KernelError: if ``count`` is above 1 in a forked process whose parent had loaded the kernels.
+    """
+    if _Threads.forked and count > 1:
+        wanted = "1 in a process forked from one that uses the kernels (spawn it instead to have more)"
+        raise KernelError(expected("kernel threads", wanted, count))
     _Threads.count = max(count, 1)
+
+
+def _after_fork() -> None:
+    """In the child: one thread, which needs nobody's company."""
+    if library.cache_info().currsize:
+        _Threads.forked, _Threads.count = True, 1
+
+
+os.register_at_fork(after_in_child=_after_fork)
 
 
 def threads() -> int:

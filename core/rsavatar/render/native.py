@@ -72,7 +72,10 @@ class _Frame:
     pool: list[int] = []  # noqa: RUF012 - one pool a process, on purpose
 
     def __init__(self) -> None:
-        self.handle = self.pool.pop() if self.pool else library().rs_frame_create()
+        try:  # one call, so that no other thread comes between looking and taking
+            self.handle = self.pool.pop()
+        except IndexError:
+            self.handle = library().rs_frame_create()
         if not self.handle:
             raise KernelError(expected("frame", "memory for a frame's plan", _REASONS[1]))
 
