@@ -47,7 +47,7 @@ STRIDE = {  # radians (metres for channel 24) over the readout at unit amplitude
 HEAD = (np.array([0.0, 0.43, 0.04]), np.array([0.0, 0.47, 0.04]), 0.125)
 GIRTH = 1.35  # clothed: makes 157 000 foreground pixels at 1024 rows
 DISTANCE = 2.7  # metres from the camera to the body
-SIGMA_PX = (1.2, 4.0)  # standard deviations of the Gaussians along the surface, pixels at 1024 rows
+SIGMA_PX = (1.2, 4.0)  # standard deviations along the surface of 13 000 Gaussians, pixels at 1024 rows
 READOUT = 1.0  # source frames; the frame's period, too
 
 
@@ -152,7 +152,8 @@ def _gaussians(size: Size, rng: np.random.Generator) -> Gaussians:
     """Flat Gaussians on the body's outer surface: two axes along it, the third, thin, along the normal."""
     points, normals = _surface(size.gaussians, rng)
     count = len(points)
-    metres = np.array([1.0, 1.0, 0.3]) * DISTANCE / (1.1 * 1024)  # per pixel of SIGMA_PX; the third is flattened
+    covering = np.sqrt(13_000 / size.gaussians)  # more of them are smaller: the body stays covered as it was
+    metres = np.array([1.0, 1.0, 0.3]) * covering * DISTANCE / (1.1 * 1024)  # per pixel; the third axis is flattened
     across = np.cross(normals, rng.normal(size=(count, 3)))
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     axes = np.stack([across, np.cross(normals, across), normals], -1)

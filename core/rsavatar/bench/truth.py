@@ -1,8 +1,8 @@
 """The truth of a moving body's image: float64, row by row, each row at its own pose, from the formulas alone.
 
-Written apart from both renderers, in numpy, with no own time, no polynomial, no shear, no strips: what they are measured
-against must not share their shortcuts. Only 3D Gaussian splatting's cutoffs (``Options``) are the same, being part of
-the image's definition. A row takes about 10 ms at scene P13's size; results are kept in the cache folder.
+Written apart from both renderers, in numpy, with no own time, no polynomial, no shear, no strips: what they are
+measured against must not share their shortcuts. Only 3D Gaussian splatting's cutoffs (``Options``) are the same, being
+part of the image's definition. Scene P13 takes about half a minute; results are kept in the cache folder.
 """
 
 from __future__ import annotations
@@ -91,9 +91,7 @@ def _activate(body: MovingBody) -> _Canonical:
     )
 
 
-def _expose_row(
-    g: _Canonical, of_joints: Array, camera: Camera, options: Options, place: tuple[int, Truth]
-) -> None:
+def _expose_row(g: _Canonical, of_joints: Array, camera: Camera, options: Options, place: tuple[int, Truth]) -> None:
     """Composite one row [W] of the Gaussians under joint transforms [24, 3, 4] into its place."""
     row, truth = place
     affine = (g.weights @ of_joints.reshape(len(of_joints), -1)).reshape(-1, 3, 4)
@@ -133,7 +131,7 @@ def _footprints(
     jacobian = np.array([[camera.fx / Z, zero, -camera.fx * X / Z**2], [zero, camera.fy / Z, -camera.fy * Y / Z**2]])
     K = jacobian.transpose(2, 0, 1) @ camera.rotation @ affine[:, :, :3] @ axes
     covariance = K @ K.transpose(0, 2, 1) + options.dilation * np.eye(2)
-    inverse = np.linalg.inv(covariance)
+    inverse: Array = np.asarray(np.linalg.inv(covariance), np.float64)
     reach = 2 * np.log(np.maximum(opacity / options.alpha_min, 1.0))
-    half = np.sqrt(reach * covariance[:, [0, 1], [0, 1]].T)
+    half: Array = np.sqrt(reach * covariance[:, [0, 1], [0, 1]].T)
     return camera.fx * X / Z + camera.cx, inverse[:, [0, 0, 1], [0, 1, 1]].T, half
