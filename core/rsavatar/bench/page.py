@@ -24,15 +24,16 @@ in axis-angle; "px of motion" is the path of its fastest Gaussian during the rea
 **Errors** are against a float64 image of which each row is posed and rendered on its own, over the pixels that anything
 was blended into; medians over seeds {seeds}, with the range. "px off" counts pixels that are wrong by more than 1/255
 in the worst seed, and "PSNR of the rest" leaves them out: above 75 dB a PSNR is made by a few dozen pixels where two
-splats lie so close in depth that rounding, or the strip's one order for all its rows, puts the wrong one in front.
+splats lie so close in depth that float32 (2.4e-7 m there), or the one order of a strip of rows, puts the wrong one in
+front.
 
 **Motion gradient**: relative error, against bands with T = H, of the gradient with respect to the spline's control
 points of a fixed linear functional of the image: the one that a squared error against the truth shifted by 3 pixels
 sends back.
 
 **Times** are medians of n rounds in which every way takes its turn, after a warm-up: the image alone, and the image
-with the gradients of all eight inputs of the renderer (poses and skinning weights included), on the whole frame. Every way
-runs on the same kernels. "The paper's way" renders {K} whole images and takes a band of rows from each; bands render
+with the gradients of all eight inputs of the renderer (poses and skinning weights included), on the whole frame. All
+ways run on the same kernels. "The paper's way" renders {K} whole images and takes a band of rows from each; bands render
 only their own rows; own time poses every Gaussian at the instant when the scan meets it. The torch twin is this
 package's own float64 reference in plain torch, run once: {twin}.
 """

@@ -36,11 +36,11 @@ def _error_panel(panel: Any, figures: Sequence[WayFigures]) -> None:
     _say(panel, at["paper"], "the paper's way", GREEN, (-4, 8), "right")
     for f in bands:
         _say(panel, f, f"T = {f.bands}", BLUE, (5, 3), "left")
-    for f, text in zip(own, ("own time", "+ shear, implicit", "scanline"), strict=True):
-        _say(panel, f, text, ORANGE, (-6, -3), "right")
+    for f, text, rise in zip(own, ("own time", "+ shear, implicit", "scanline"), (0, 1, -8), strict=True):
+        _say(panel, f, text, ORANGE, (-6, rise), "right")
     panel.set_xscale("log")
     panel.set_yscale("log")
-    panel.margins(x=0.25, y=0.08)
+    panel.margins(x=0.35, y=0.08)
 
 
 def _places(figures: Sequence[WayFigures]) -> tuple[list[float], list[float]]:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from rsavatar.bench.results import Curve, GrowthResult, Point, RenderResult, Target, WayFigures
 
-
 WIDTH = 140  # columns of a terminal that the widest table needs; narrower ones wrap its lines
 
 
