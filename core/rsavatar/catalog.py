@@ -13,6 +13,7 @@ METHODS: dict[str, str] = {
 }
 
 MOTIONS: dict[str, str] = {
+    "sequence-spline": "rsavatar.motion.sequence:SequenceSpline",
     "frame-spline": "rsavatar.motion.spline:FrameSpline",
     "still": "rsavatar.motion.still:StillPose",
 }

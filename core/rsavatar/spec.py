@@ -20,6 +20,7 @@ from rsavatar.errors import SpecError, expected
 
 Preset = Literal["smoke", "draft", "paper"]
 Bands = Annotated[int, Field(ge=1, le=8192)] | Annotated[str, Field(pattern=r"^([2-9]|[1-9][0-9])?K$|^scanline$")]
+BANDS_WANTED = "an integer from 1 to 8192, K, 2K to 99K, or scanline"
 
 SELECTING_METHODS = frozenset({"rs-avatar", "oracle"})  # methods whose shutter selects rows
 FLAGS_OF_METHOD: dict[str, frozenset[str]] = {  # the components that a method has, so can lose
@@ -63,12 +64,15 @@ class JobSpec(BaseModel):
     T: Bands | None = Field(None, description="row bands: an integer, K, 2K, 4K, or scanline; none = K")
     P: int = Field(4, ge=2, le=8, description="control points per frame; the trajectory has degree P - 1")
     lambda_reg: float = Field(1.0, ge=0, le=1e4, alias="lambda", description="weight of the continuity penalty")
-    ablation: Ablation = Field(default_factory=Ablation, description="components to remove")
+    ablation: Ablation = Field(Ablation(), description="components to remove")
     iterations: int = Field(20_000, ge=1, le=1_000_000, description="optimiser steps, one frame of one camera each")
     seed: int = Field(0, ge=0, lt=2**31, description="seed of every random choice")
     priority: int = Field(0, ge=-10, le=10, description="higher runs earlier; does not change the result")
 
     body: str = Field("auto", max_length=1024, description="auto, anny, or a path to an SMPL-format .npz or .pkl")
+    motion: Literal["sequence-spline", "frame-spline"] = Field(
+        "sequence-spline", description="one spline over the sequence, or P control points a frame tied by L_reg"
+    )
     continuity: Literal["aligned", "paper"] = Field("aligned", description="instants that L_reg compares")
     perturbation: Literal["zero-mean", "positive"] = Field("zero-mean", description="noise on initial control points")
     sh_degree: int = Field(1, ge=0, le=1, description="highest spherical-harmonics degree of the colours")
@@ -84,6 +88,8 @@ class JobSpec(BaseModel):
         if alien:
             has = ", ".join(sorted(FLAGS_OF_METHOD.get(self.method, frozenset()))) or "no flags"
             raise ValueError(expected("ablation", f"components that {self.method} has ({has})", ", ".join(alien)))
+        if self.ablation.no_reg and self.motion == "sequence-spline":
+            raise ValueError(expected("ablation.no_reg", "motion frame-spline, which has a penalty", repr(self.motion)))
         if self.T == "scanline" and self.method == "mad-avatar":
             raise ValueError(expected("T", "a finite number of renders for mad-avatar to average", "'scanline'"))
         return self
@@ -124,7 +130,9 @@ def read_preset(name: str) -> dict[str, Any]:
 def resolve(request: Mapping[str, Any]) -> JobSpec:
     """Lay a partial request over its preset and validate the whole.
 
-    A preset's ``T`` speaks of the rolling-shutter model, so it is not laid under methods that do not select rows.
+    A preset's ``T`` speaks of the rolling-shutter model, so it is not laid under methods that do not select rows. A
+    request that names P, lambda, continuity, perturbation or no_reg means the paper's per-frame spline, which alone has
+    them.
 
     Raises:
         SpecError: naming every offending field with what was expected and what was got.
@@ -132,14 +140,33 @@ def resolve(request: Mapping[str, Any]) -> JobSpec:
     preset = read_preset(str(request.get("preset", "draft")))
     if request.get("method") not in SELECTING_METHODS:
         preset.pop("T", None)
+    named = {_ALIASES.get(k, k): v for k, v in request.items() if v is not None}
+    if "motion" not in named and _speaks_of_frames(named):
+        named["motion"] = "frame-spline"
     try:
-        return JobSpec.model_validate({**preset, **{k: v for k, v in request.items() if v is not None}})
+        return JobSpec.model_validate({**preset, **named})
     except ValidationError as error:
-        raise SpecError("; ".join(_sentence(e) for e in error.errors())) from None
+        raise SpecError("; ".join(dict.fromkeys(map(_sentence, error.errors())))) from None
+
+
+_ALIASES = {"lambda_reg": "lambda"}
+FRAME_SPLINE_WORDS = ("P", "lambda", "continuity", "perturbation")
+
+
+def _speaks_of_frames(named: Mapping[str, Any]) -> bool:
+    """Whether a request names what only the paper's per-frame spline has."""
+    ablation = named.get("ablation")
+    no_reg = isinstance(ablation, Mapping) and bool(ablation.get("no_reg"))
+    return no_reg or any(word in named for word in FRAME_SPLINE_WORDS)
 
 
 def _sentence(error: Any) -> str:
-    where = ".".join(str(part) for part in error["loc"])
+    where = [str(part) for part in error["loc"]]
     if not where:  # raised by _consistent: already name, expected, got
         return str(error["msg"]).removeprefix("Value error, ")
-    return expected(where, error["msg"].lower(), repr(error["input"]))
+    if where[0] == "T":  # a union: pydantic reports each branch
+        return expected("T", BANDS_WANTED, repr(error["input"]))
+    if error["type"] == "missing":
+        return expected(".".join(where), "a value", "none")
+    message = str(error["msg"])
+    return expected(".".join(where), message[:1].lower() + message[1:], repr(error["input"]))

@@ -68,7 +68,7 @@ def test_a_presets_scanline_is_not_laid_under_methods_that_select_no_rows() -> N
         ({"preset": "quick"}, "preset: expected one of draft, paper, smoke, got 'quick'"),
         ({"iterations": 0}, "iterations: expected .* greater than or equal to 1, got 0"),
         ({"P": 1}, "P: expected .* greater than or equal to 2, got 1"),
-        ({"T": 0}, "T.*greater than or equal to 1, got 0"),
+        ({"T": 0}, "T: expected an integer from 1 to 8192, K, 2K to 99K, or scanline, got 0"),
         ({"T": "some"}, "T.*got 'some'"),
         ({"T": "1K"}, "T.*got '1K'"),
         ({"seed": -1}, "seed: expected .*got -1"),
@@ -101,7 +101,7 @@ def test_equal_words_in_another_order_are_the_same_job() -> None:
 def test_the_hash_ignores_priority_and_nothing_else() -> None:
     changes: dict[str, Any] = {
         "method": "gauhuman", "subject": "walk", "K": 7, "T": 5, "P": 3, "lambda": 2.0, "seed": 1, "iterations": 5,
-        "preset": "smoke", "body": "anny", "continuity": "paper", "perturbation": "positive", "sh_degree": 0,
+        "preset": "smoke", "body": "anny", "motion": "frame-spline", "continuity": "paper", "perturbation": "positive", "sh_degree": 0,
         "mask_weight": 0.5, "densify": False, "checkpoint_every": 7, "ablation": {"no_rs": True},
     }  # fmt: skip
     names = {field.alias or name for name, field in JobSpec.model_fields.items()}

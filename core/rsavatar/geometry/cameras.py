@@ -1,7 +1,8 @@
 """Pinhole cameras, OpenCV axes (x right, y down, z forward).
 
 **Convention**: pixel centres lie at half integers, so the first pixel's centre is (0.5, 0.5) and the image spans
-[0, W] x [0, H]. Data whose K is for centres at whole integers (OpenCV's own convention) adds 0.5 to cx and cy on loading.
+[0, W] x [0, H]. Data whose K is for centres at whole integers (OpenCV's own convention) has 0.5 added to cx
+and cy on loading.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ class Camera:
             raise DataError(expected("camera focal lengths and size", "positive numbers", self))
         error = np.abs(self.rotation @ self.rotation.T - np.eye(3)).max()
         if error > 1e-3 or np.linalg.det(self.rotation) < 0:
-            raise DataError(expected("camera rotation", "an orthonormal matrix of determinant 1", self.rotation.tolist()))
+            wanted = "an orthonormal matrix of determinant 1"
+            raise DataError(expected("camera rotation", wanted, self.rotation.tolist()))
 
     @property
     def centre(self) -> Array:
@@ -57,9 +59,15 @@ class Camera:
 
     def scaled(self, factor: float) -> Camera:
         """The same camera with pixels ``1 / factor`` times as large."""
-        size = {"height": round(self.height * factor), "width": round(self.width * factor)}
-        intrinsics = {name: getattr(self, name) * factor for name in ("fx", "fy", "cx", "cy")}
-        return replace(self, **intrinsics, **size)
+        return replace(
+            self,
+            fx=self.fx * factor,
+            fy=self.fy * factor,
+            cx=self.cx * factor,
+            cy=self.cy * factor,
+            height=round(self.height * factor),
+            width=round(self.width * factor),
+        )
 
     def project(self, points: Array) -> tuple[Array, Array]:
         """World points [..., 3] to pixels [..., 2] and depths [...] (metres; negative behind the camera)."""

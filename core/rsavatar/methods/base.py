@@ -17,6 +17,9 @@ from rsavatar.data.base import BodyFit, Bytes, Subject
 from rsavatar.errors import DataError, SpecError, expected
 from rsavatar.imaging import Actor, plan
 from rsavatar.motion.base import AbstractMotion, InitialMotion
+from rsavatar.motion.sequence import SequenceSpline
+from rsavatar.motion.spline import FrameSpline
+from rsavatar.motion.still import StillPose
 from rsavatar.optimization import Settings
 from rsavatar.shutter.base import AbstractShutter
 from rsavatar.spec import JobSpec
@@ -44,6 +47,16 @@ class Case:
         """The per-frame fit and the frames' clock."""
         fit, timing = self.subject.fit, self.subject.timing
         return InitialMotion(fit.poses, fit.Rh, fit.Th, timing.mid_frames, timing.period_frames, timing.readout_frames)
+
+
+def sub_frame_motion(case: Case) -> AbstractMotion:
+    """The motion of the methods that know of instants within a frame; one pose a frame under ``no_spline``."""
+    spec, initial = case.spec, case.initial_motion()
+    if spec.ablation.no_spline:
+        return StillPose(initial)
+    if spec.motion == "sequence-spline":
+        return SequenceSpline(initial)
+    return FrameSpline(initial, case.bands, spec.P, spec.perturbation, spec.seed)
 
 
 class AbstractMethod(ABC):

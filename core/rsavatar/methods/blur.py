@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from rsavatar.methods.base import AbstractMethod, Case
+from rsavatar.methods.base import AbstractMethod, Case, sub_frame_motion
 from rsavatar.motion.base import AbstractMotion
-from rsavatar.motion.spline import FrameSpline
-from rsavatar.motion.still import StillPose
 from rsavatar.shutter.base import AbstractShutter
 from rsavatar.shutter.rolling import Blur
 
@@ -15,10 +13,7 @@ class BlurAvatar(AbstractMethod):
 
     def motion(self, case: Case) -> AbstractMotion:
         """The same as ``RollingShutterAvatar``'s."""
-        spec = case.spec
-        if spec.ablation.no_spline:
-            return StillPose(case.initial_motion())
-        return FrameSpline(case.initial_motion(), case.bands, spec.P, spec.perturbation, spec.seed)
+        return sub_frame_motion(case)
 
     def shutter(self, case: Case) -> AbstractShutter:
         """The mean of T instants over the readout."""

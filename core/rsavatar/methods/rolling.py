@@ -1,11 +1,9 @@
-"""RS-Avatar: a spline in every frame, and rows that select their instant (paper, sections 3.2 to 3.4)."""
+"""RS-Avatar: a trajectory within every frame, and rows that select their instant (paper, sections 3.2 to 3.4)."""
 
 from __future__ import annotations
 
-from rsavatar.methods.base import AbstractMethod, Case
+from rsavatar.methods.base import AbstractMethod, Case, sub_frame_motion
 from rsavatar.motion.base import AbstractMotion
-from rsavatar.motion.spline import FrameSpline
-from rsavatar.motion.still import StillPose
 from rsavatar.shutter.base import AbstractShutter
 from rsavatar.shutter.rolling import Bands, Instant, Scanline
 
@@ -14,11 +12,8 @@ class RollingShutterAvatar(AbstractMethod):
     """Ours: the shutter that the sensor has."""
 
     def motion(self, case: Case) -> AbstractMotion:
-        """A spline per frame (eq. spline); one pose per frame without it."""
-        spec = case.spec
-        if spec.ablation.no_spline:
-            return StillPose(case.initial_motion())
-        return FrameSpline(case.initial_motion(), case.bands, spec.P, spec.perturbation, spec.seed)
+        """One spline over the sequence, or the paper's one per frame (eq. spline)."""
+        return sub_frame_motion(case)
 
     def shutter(self, case: Case) -> AbstractShutter:
         """Rows (eq. rs) or T bands of them (eq. rs_discrete); the mid instant for all without the shutter model."""

@@ -14,6 +14,7 @@ class Instant(AbstractShutter):
     """Global shutter: the whole image at the mid time (paper, table "Shutter regimes", first row)."""
 
     def slots(self, height: int, readout: float, trigger: float) -> tuple[Slot, ...]:
+        """One slot, at the trigger."""
         return (Slot(0, height, trigger),)
 
 
@@ -24,6 +25,7 @@ class Blur(AbstractShutter):
     instants: int
 
     def slots(self, height: int, readout: float, trigger: float) -> tuple[Slot, ...]:
+        """A slot per instant, all of them over all rows."""
         times = _band_times(self.instants, readout, trigger)
         return tuple(Slot(0, height, t, weight=1.0 / self.instants) for t in times)
 
@@ -38,6 +40,7 @@ class Bands(AbstractShutter):
     bands: int
 
     def slots(self, height: int, readout: float, trigger: float) -> tuple[Slot, ...]:
+        """A slot per band that holds a row."""
         times = _band_times(self.bands, readout, trigger)
         edges = [-(-i * height // self.bands) for i in range(self.bands + 1)]
         return tuple(Slot(lo, hi, t) for lo, hi, t in zip(edges, edges[1:], times, strict=False) if hi > lo)
@@ -56,6 +59,7 @@ class Scanline(AbstractShutter):
     direction: Literal["down", "up"] = "down"
 
     def slots(self, height: int, readout: float, trigger: float) -> tuple[Slot, ...]:
+        """A slot per sample of the exposure, all of them scanning."""
         rate = readout / height
         start = trigger - readout / 2
         if self.direction == "up":
