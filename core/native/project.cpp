@@ -37,13 +37,15 @@ static void opacity_of(Floats logit, Floats &opacity, Floats &log2_opacity) {
     log2_opacity = log2(opacity);
 }
 
-// Where every number that a Gaussian consists of, its pose's among them, is finite: 0 times anything else is not 0.
+// Where every number that a Gaussian consists of, its pose's among them, is finite. By the sum's exponent bits: GCC folds
+// arithmetic that is meant to tell NaN.
 static Ints finite(const Block &block, const RsGaussians &g, const Posed &p, const Footprint &f, const Shading &s) {
     size_t M = g.count;
     Floats all = p.world.x + p.world.y + p.world.z + p.velocity.x + p.velocity.y + p.velocity.z + block.get(g.opacity_logits);
     for (int i = 0; i < 4; i++) all += f.q[i];
     for (int i = 0; i < 3; i++) all += block.get(g.log_scales + i * M) + s.colour[i];
-    return (all + block.get(g.screen) + block.get(g.screen + M)) * 0.f == 0.f;
+    all += block.get(g.screen) + block.get(g.screen + M);
+    return ((Ints)all & 0x7f800000) != 0x7f800000;
 }
 
 static void project_block(const RsFrame &frame, const RsGaussians &g, const float *pose, int first, Slot &slot) {
