@@ -72,7 +72,7 @@ class TestMotionContract:
         assert all(f.dtype == torch.float32 for f in fields(state))
         truth = np.random.default_rng(0)
         poses = 0.3 * truth.normal(size=(FRAMES, 72))
-        np.testing.assert_allclose(state.rotations[0, 1:].detach().reshape(-1), poses[2, 3:], atol=0.2)  # a spline smooths noise
+        np.testing.assert_allclose(state.rotations[0, 1:].detach().reshape(-1), poses[2, 3:], atol=0.2)
 
     def test_every_channel_of_a_frame_is_learnable(self, motion: AbstractMotion) -> None:
         state = motion.state(1, torch.tensor([0.0]))

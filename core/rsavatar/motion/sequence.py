@@ -60,6 +60,6 @@ class SequenceSpline(AbstractMotion):
         design.scatter_(1, first[:, None] + torch.arange(ORDER), weights)
         slope = torch.diff(torch.eye(count, dtype=torch.float64), dim=0)
         bend = torch.diff(slope, dim=0)
-        normal = design.T @ design + SMOOTHING * bend.T @ bend + 1e-6 * slope.T @ slope  # the last: for a single frame
+        normal = design.T @ design + SMOOTHING * bend.T @ bend + 1e-9 * slope.T @ slope  # the last: one frame
         flat: Tensor = torch.linalg.solve(normal, design.T @ values.flatten(1))
         return flat.reshape(count, *values.shape[1:])
