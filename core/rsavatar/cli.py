@@ -111,7 +111,7 @@ def _add_local(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     run.add_argument("--out", type=Path, metavar="DIR", help="where to write (default: runs/SUBJECT-METHOD-HASH)")
 
     bench = _add(verbs, "bench", "rsavatar.cli_local:bench", "measure speed or stability on this machine")
-    bench.add_argument("name", choices=["render", "train", "stability"])
+    bench.add_argument("name", choices=["render", "growth", "train", "stability"])
     bench.add_argument("--json", type=Path, metavar="FILE", help="write the figures here as well")
 
     nouns = verbs.add_parser("data", help="look at or make subjects").add_subparsers(required=True, metavar="VERB")

@@ -1,8 +1,8 @@
 """Errors of every way to render, against the row-by-row truth, over several seeds of the scene.
 
 A pixel's depth order is decided by differences that can be smaller than float32 resolves: where two splats are at the
-same depth to 2.4e-7 m, their order is a matter of luck and a few dozen pixels with it. They decide a PSNR above 75 dB, so
-errors are medians over seeds, and every seed's value is kept. ``off_px`` counts such pixels, ``psnr_rest_db`` leaves
+same depth to 2.4e-7 m, their order is a matter of luck, and a few dozen pixels with it. They decide a PSNR above 75 dB.
+So errors are medians over seeds, and every seed's value is kept; ``off_px`` counts such pixels, ``psnr_rest_db`` leaves
 them out.
 """
 

@@ -33,9 +33,9 @@ sends back.
 
 **Times** are medians of n rounds in which every way takes its turn, after a warm-up: the image alone, and the image
 with the gradients of all eight inputs of the renderer (poses and skinning weights included), on the whole frame. All
-ways run on the same kernels. "The paper's way" renders {K} whole images and takes a band of rows from each; bands render
-only their own rows; own time poses every Gaussian at the instant when the scan meets it. The torch twin is this
-package's own float64 reference in plain torch, run once: {twin}.
+ways run on the same kernels. "The paper's way" renders {K} whole images and takes a band of rows from each; bands
+render only their own rows; own time poses every Gaussian at the instant when the scan meets it. The torch twin is
+this package's own float64 reference in plain torch, run once: {twin}.
 """
 GROWTH = """\
 **What is measured.** Scene P13 with one size changed at a time. More Gaussians are smaller ones, so that the body stays

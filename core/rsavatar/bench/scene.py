@@ -108,9 +108,11 @@ def build(size: Size) -> MovingBody:
         return MovingBody(gaussians, _motion(amplitude, stride, jitter), camera)
 
     amplitude = size.motion_px / 50  # the stride's is about that
-    for _ in range(12):  # the path is almost proportional to the amplitude, so this fixed point is reached fast
-        amplitude *= size.motion_px / longest_path(moving(amplitude))
-    return moving(amplitude)
+    made = moving(amplitude)
+    while abs(off := longest_path(made) / size.motion_px - 1) > 1e-5:  # nearly proportional: a few rounds
+        amplitude /= 1 + off
+        made = moving(amplitude)
+    return made
 
 
 def longest_path(body: MovingBody) -> float:
@@ -211,7 +213,7 @@ def _skin_weights(points: Array) -> Array:
     for joint, a, b in bones:
         distance[:, joint] = np.minimum(distance[:, joint], _to_segment(points, a, b))
     weights = np.exp((distance.min(1, keepdims=True) - distance) / 0.025)
-    weights[weights < np.sort(weights, 1)[:, -4:-3]] = 0
+    np.put_along_axis(weights, np.argsort(weights, 1)[:, :-4], 0.0, 1)
     return np.asarray(weights / weights.sum(1, keepdims=True))
 
 

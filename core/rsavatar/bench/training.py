@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
@@ -99,19 +99,7 @@ def _observe(body: MovingBody, way: Way) -> Observation:
 
 def _actor(body: MovingBody, size: Size, frames: int) -> Actor:
     """The body's Gaussians on a mesh with SMPL's number of vertices, in its own motion, with blend shapes of zero."""
-    vertices = build(replace(size, gaussians=VERTICES)).gaussians
-    points = vertices.means.double().T.numpy()
-    model = BodyModel(
-        v_template=points,
-        faces=np.zeros((0, 3), np.int64),
-        weights=vertices.skin_weights.double().T.numpy(),
-        joint_regressor=REST_JOINTS @ np.linalg.pinv(points),
-        parents=PARENTS,
-        shape_directions=np.zeros((VERTICES, 3, SHAPES)),
-        pose_directions=None,
-        name="capsules",
-    )
-    avatar, g = Avatar(Surface(model, np.zeros(SHAPES))), body.gaussians
+    avatar, g = Avatar(Surface(_mesh(size.seed), np.zeros(SHAPES))), body.gaussians
     avatar.means = torch.nn.Parameter(g.means.clone())
     avatar.rotations = torch.nn.Parameter(g.rotations.clone())
     avatar.log_scales = torch.nn.Parameter(g.log_scales.clone())
@@ -121,6 +109,23 @@ def _actor(body: MovingBody, size: Size, frames: int) -> Actor:
     avatar.bind()
     pose_offsets = torch.zeros(frames, 3, VERTICES)
     return Actor(avatar, _motion(body, frames), pose_offsets, PoseResidual(), SkinOffset())
+
+
+@cache
+def _mesh(seed: int) -> BodyModel:
+    """Vertices on the body of capsules; no faces, shapes that change nothing."""
+    vertices = build(Size(gaussians=VERTICES, seed=seed)).gaussians
+    points = vertices.means.double().T.numpy()
+    return BodyModel(
+        v_template=points,
+        faces=np.zeros((0, 3), np.int64),
+        weights=vertices.skin_weights.double().T.numpy(),
+        joint_regressor=REST_JOINTS @ np.linalg.pinv(points),
+        parents=PARENTS,
+        shape_directions=np.zeros((VERTICES, 3, SHAPES)),
+        pose_directions=None,
+        name="capsules",
+    )
 
 
 def _motion(body: MovingBody, frames: int) -> FrameSpline:
