@@ -23,7 +23,7 @@ FAR = 4.0  # times the best block's mean loss: diverged. Sound runs, density con
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's step sizes: GauHuman's for the Gaussians, MAD-Avatar's for the motion."""
+    """Adam's step sizes, and how large a Gaussian may grow. These are the authors': GauHuman's and MAD-Avatar's."""
 
     means: float = 1.6e-4  # times the extent; falls to 1/100 of itself, log-linearly
     colours: float = 2.5e-3
@@ -34,6 +34,12 @@ class Rates:
     motion: float = 1e-3  # control points and shape; falls to 1/100 of itself, log-linearly
     pose_residual: float = 5e-5
     skin_offset: float = 5e-4  # one step a block, on the sum of its gradients
+    largest: float = math.inf  # metres
+
+
+# Four views cannot tell a displaced limb from displaced Gaussians, nor a limb from its visual hull. So the motion moves
+# first, and the Gaussians stay where the body puts them, too small to stick out of it between two views.
+POSE_FIRST = Rates(means=3e-5, motion=3e-3, largest=0.010)
 
 
 @dataclass(frozen=True)
@@ -106,6 +112,7 @@ class State:
         skin = list(actor.skin_offset.parameters()) if actor.skin_offset else [torch.nn.Parameter(torch.zeros(0))]
         self.skin_optimizer = torch.optim.Adam(skin, lr=rates.skin_offset, fused=True)
         self.gradients = ScreenGradients(actor.avatar.count)
+        self.largest = rates.largest
         self.step = 0
         self.rejected = 0
         self.rejected_in_a_row = 0
@@ -122,6 +129,7 @@ class State:
         """
         if _finite(loss, screen, actor):
             self.optimizer.step()
+            actor.avatar.limit_scales(self.largest)
             self.gradients.add(_grad(screen), *size)
             self.rejected_in_a_row = 0
             self.losses.append(float(loss))

@@ -75,8 +75,11 @@ class JobSpec(BaseModel):
     )
     continuity: Literal["aligned", "paper"] = Field("aligned", description="instants that L_reg compares")
     perturbation: Literal["zero-mean", "positive"] = Field("zero-mean", description="noise on initial control points")
+    regime: Literal["pose-first", "authors"] = Field(
+        "pose-first", description="step sizes: the motion fast and the Gaussians slow and small, or the authors' own"
+    )
     sh_degree: int = Field(1, ge=0, le=1, description="highest spherical-harmonics degree of the colours")
-    mask_weight: float = Field(0.1, ge=0, le=10, description="weight of the L1 between opacity and body mask")
+    mask_weight: float = Field(0.5, ge=0, le=10, description="weight of the L1 between opacity and body mask")
     densify: bool = Field(True, description="adaptive density control: clone, split, prune")
     checkpoint_every: int = Field(1000, ge=1, description="steps between checkpoints")
 

@@ -52,6 +52,9 @@ class TestMotionContract:
             assert [tuple(f.shape) for f in fields(state)] == [(count, 24, 3), (count, 3), (count, 3)]
         assert motion.at(torch.zeros(2, 5)).rotations.shape == (2, 5, 24, 3)
 
+    def test_parameters_are_contiguous_as_those_of_a_checkpoint(self, motion: AbstractMotion) -> None:
+        assert all(parameter.is_contiguous() for parameter in motion.parameters())
+
     def test_root_rotation_is_zero(self, motion: AbstractMotion) -> None:
         assert float(motion.state(1, torch.linspace(-5, 5, 3)).rotations[:, 0].detach().abs().max()) == 0
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -47,6 +49,11 @@ class Avatar(torch.nn.Module):
         self.vertex, distance = self.surface.nearest(self.means)
         self.prior = self.surface.weights[:, self.vertex].contiguous()
         return distance
+
+    def limit_scales(self, largest: float) -> None:
+        """Cut every axis of every Gaussian to at most ``largest`` metres."""
+        if largest < math.inf:
+            self.log_scales.data.clamp_(max=math.log(largest))
 
     def shaped_means(self, shape_change: Tensor, pose_offset: Tensor | None) -> Tensor:
         """Canonical means [3, M] with blend shapes added.

@@ -20,7 +20,7 @@ from rsavatar.motion.base import AbstractMotion, InitialMotion
 from rsavatar.motion.sequence import SequenceSpline
 from rsavatar.motion.spline import FrameSpline
 from rsavatar.motion.still import StillPose
-from rsavatar.optimization import Settings
+from rsavatar.optimization import POSE_FIRST, Rates, Settings
 from rsavatar.shutter.base import AbstractShutter
 from rsavatar.spec import JobSpec
 from rsavatar.train import Observation
@@ -155,6 +155,7 @@ def settings(case: Case) -> Settings:
     spec = case.spec
     centres = np.stack([case.subject.cameras[name].centre for name in case.subject.training])
     spread = float(np.linalg.norm(centres - centres.mean(0), axis=1).max())
+    authors = spec.regime == "authors"
     return Settings(
         iterations=spec.iterations,
         seed=spec.seed,
@@ -164,5 +165,6 @@ def settings(case: Case) -> Settings:
         mask_weight=spec.mask_weight,
         sh_degree=spec.sh_degree,
         checkpoint_every=spec.checkpoint_every,
-        density=DensityRules() if spec.densify else None,
+        density=(DensityRules() if authors else DensityRules(gradient=4e-4)) if spec.densify else None,
+        rates=Rates() if authors else POSE_FIRST,
     )

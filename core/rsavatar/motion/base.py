@@ -56,7 +56,8 @@ class AbstractMotion(torch.nn.Module, ABC):
 
     **Contract**: ``at(mid_frames[n] + offset)`` is ``state(n, offset)`` wherever frame n is the nearest; the root's
     rotation is zero; ``penalty`` is at least 0. All of it is differentiable in the module's parameters, ``state`` in
-    ``offsets`` and ``at`` in ``times``, too.
+    ``offsets`` and ``at`` in ``times``, too. Parameters are contiguous: a checkpoint's are, and sums over other strides
+    round differently.
     """
 
     mid_frames: Tensor  # [N] float64, source frames

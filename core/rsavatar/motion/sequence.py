@@ -49,7 +49,7 @@ class SequenceSpline(AbstractMotion):
     def _support(self, times: Tensor, count: int) -> tuple[Tensor, Tensor]:
         """First of the four control points at ``times`` [...], and their weights [..., 4] (paper, eq. spline)."""
         place = (times.double() - self.start) / self.spacing
-        first = place.detach().floor().clamp(0, count - ORDER)
+        first = place.detach().floor().nan_to_num(0.0).clamp(0, count - ORDER)  # a NaN stays one in the weights
         powers = (place - first)[..., None] ** torch.arange(ORDER)
         return first.long(), powers @ self.basis
 
@@ -62,4 +62,4 @@ class SequenceSpline(AbstractMotion):
         bend = torch.diff(slope, dim=0)
         normal = design.T @ design + SMOOTHING * bend.T @ bend + 1e-9 * slope.T @ slope  # the last: one frame
         flat: Tensor = torch.linalg.solve(normal, design.T @ values.flatten(1))
-        return flat.reshape(count, *values.shape[1:])
+        return flat.reshape(count, *values.shape[1:]).contiguous()  # solve's answer is column-major
