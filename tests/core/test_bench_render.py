@@ -13,6 +13,7 @@ from torch import Tensor
 from rsavatar import kernels
 from rsavatar.bench import growth, page, render, results, tables
 from rsavatar.bench.accuracy import compare, errors
+from rsavatar.bench.memory import MB, render_mb
 from rsavatar.bench.results import GrowthResult, RenderResult, Target
 from rsavatar.bench.scene import READOUT, MovingBody, Size, build, longest_path
 from rsavatar.bench.timing import interleave, ratio
@@ -148,6 +149,11 @@ def test_a_target_knows_its_side() -> None:
     assert not Target.at_least(80, 79.9, "quality").met
 
 
+def test_memory_of_a_render_holds_at_least_its_image() -> None:
+    pixels = 400
+    assert 4 * 4 * pixels**2 / MB < render_mb(replace(SIZE, pixels=pixels), None) < 100
+
+
 def test_render_and_growth_end_in_a_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RSAVATAR_CACHE", str(tmp_path))
     plan = render.Plan(SIZE, seeds=(0, 1), motions_px=(4.0, 8.0), main_px=8.0, K=4, rounds=2, twin=False)
@@ -157,7 +163,7 @@ def test_render_and_growth_end_in_a_page(tmp_path: Path, monkeypatch: pytest.Mon
     assert all(0.5 < order.order < 1.5 for order in measured.orders)  # midpoints of bands: first order
 
     axes = {"gaussians": (200, 400), "pixels": (48, 96), "bands": (1, 4), "whole": (1,), "frames": (2,)}
-    grown = growth.measure(growth.Plan(SIZE, **axes, memory_bands=(1,), K=4, rounds=2, step_rounds=2))
+    grown = growth.measure(growth.Plan(SIZE, **axes, memory_bands=(), K=4, rounds=2, step_rounds=2))
     results.write(grown, tmp_path / "growth.json")
     assert GrowthResult.model_validate_json((tmp_path / "growth.json").read_text()) == grown
 
