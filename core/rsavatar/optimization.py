@@ -142,17 +142,21 @@ class State:
         self.optimizer.zero_grad(set_to_none=True)
         self.step += 1
 
+    def require_finite(self, actor: Actor) -> None:
+        """Raise ``DivergedError`` naming a parameter that holds NaN or infinity."""
+        for name, parameter in actor.named_parameters():
+            if not torch.isfinite(parameter).all():
+                raise DivergedError(
+                    f"diverged at step {self.step}: {expected(name, 'finite numbers', 'NaN or infinity')}"
+                )
+
     def close_block(self, actor: Actor) -> int:
         """Judge the block of steps that ends here, before anything of it is saved; returns how many were rejected.
 
         Raises:
             DivergedError: if a parameter is not finite, or the mean loss is ``FAR`` times the best block's.
         """
-        for name, parameter in actor.named_parameters():
-            if not torch.isfinite(parameter).all():
-                raise DivergedError(
-                    f"diverged at step {self.step}: {expected(name, 'finite numbers', 'NaN or infinity')}"
-                )
+        self.require_finite(actor)
         if self.losses:
             mean = sum(self.losses) / len(self.losses)
             if mean > FAR * self.best:

@@ -110,6 +110,7 @@ def _control_density(actor: Actor, state: State, settings: Settings, rules: Dens
     before = actor.avatar.count
     edit, done = decide(actor.avatar, state.gradients.mean(), settings.extent, rules, seed)
     state.edit(actor, edit)
+    state.require_finite(actor)
     grown = actor.avatar.count
     state.edit(actor, prune(actor.avatar, actor.avatar.bind(), rules))
     actor.avatar.bind()

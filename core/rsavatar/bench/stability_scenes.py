@@ -95,7 +95,7 @@ GAUSSIANS: dict[str, tuple[Change, bool]] = {  # and whether the twin has the sa
     "scale 100 m": (filled("log_scales", math.log(100.0)), True),
     "log scale 1e4": (filled("log_scales", 1e4), False),
     "log scale -1e4": (filled("log_scales", -1e4), True),
-    "splats ten times the image": (filled("log_scales", math.log(10.0)), True),
+    "splats many times the image": (lambda s: gaussians(s, log_scales=s.gaussians.log_scales + math.log(500)), True),
     "zero quaternions": (filled("rotations", 0.0), True),
     "quaternions of length 1e3": (lambda s: gaussians(s, rotations=1e3 * s.gaussians.rotations), True),
     "quaternions of length 1e-3": (lambda s: gaussians(s, rotations=1e-3 * s.gaussians.rotations), True),
