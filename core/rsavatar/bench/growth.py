@@ -8,7 +8,6 @@ its block); of the peak memory of a render. More Gaussians are smaller ones: the
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import median
@@ -21,7 +20,7 @@ from rsavatar.bench.machine import describe
 from rsavatar.bench.memory import render_mb
 from rsavatar.bench.results import Curve, GrowthResult, Point, Ratio, Target
 from rsavatar.bench.scene import Size, build
-from rsavatar.bench.timing import interleave, ratio
+from rsavatar.bench.timing import interleave, narrate, ratio
 from rsavatar.bench.training import Training
 from rsavatar.bench.ways import Exposure, Way, in_bands, paper, scan
 
@@ -96,6 +95,7 @@ def _name(way: str, threads: int) -> str:
 
 def _point(x: float, size: Size, plan: Plan) -> Point:
     """Render and training step of the scanline at a size."""
+    narrate(f"{size.gaussians} Gaussians, {size.pixels} px, {kernels.threads()} threads")
     way = _scanline(size)
     shot = _exposure(size, way)
     taken = interleave({"forward": shot.forward, "total": shot.total}, plan.rounds)
@@ -123,27 +123,24 @@ def _step(training: Training, rounds: int) -> list[float]:
 
 
 def _bands(plan: Plan) -> list[Curve]:
-    """Render time by T: bands, the paper's way, and the scanline, which has no T, at each of them."""
+    """Render time by T: bands, the paper's way, and, measured once, the scanline, which has no T."""
+    narrate("bands")
     height = plan.size.pixels
-    make: dict[str, tuple[tuple[int, ...], Callable[[int], Way]]] = {
-        "bands": (plan.bands, lambda T: in_bands(height, T)),
-        "the paper's way": (plan.whole, lambda T: paper(height, T)),
-        "scanline": ((1, height), lambda _: _scanline(plan.size)),
-    }
-    shots = {(name, T): _exposure(plan.size, way(T)) for name, (each, way) in make.items() for T in each}
-    forward = interleave({f"{n} {T}": shot.forward for (n, T), shot in shots.items()}, plan.rounds)
-    total = interleave({f"{n} {T}": shot.total for (n, T), shot in shots.items()}, plan.rounds)
+    ways = [in_bands(height, T) for T in plan.bands] + [_scanline(plan.size)]
+    ways += [replace(paper(height, T), name=f"paper-{T}") for T in plan.whole]
+    shots = {way.name: _exposure(plan.size, way) for way in ways}
+    forward = interleave({name: shot.forward for name, shot in shots.items()}, plan.rounds)
+    total = interleave({name: shot.total for name, shot in shots.items()}, plan.rounds)
+
+    def curve(name: str, places: dict[int, str]) -> Curve:
+        points = [Point(x=T, forward_ms=median(forward[way]), total_ms=median(total[way])) for T, way in places.items()]
+        fixed = f"{plan.size.gaussians} Gaussians, {height} x {height} px, threads: {kernels.threads()}"
+        return Curve(axis="bands", name=name, fixed=fixed, points=points)
+
     return [
-        Curve(
-            axis="bands",
-            name=name,
-            fixed=f"{plan.size.gaussians} Gaussians, {height} x {height} px, {kernels.threads()} threads",
-            points=[
-                Point(x=T, forward_ms=median(forward[f"{name} {T}"]), total_ms=median(total[f"{name} {T}"]))
-                for T in each
-            ],
-        )
-        for name, (each, _) in make.items()
+        curve("bands", {T: f"bands-{T}" for T in plan.bands}),
+        curve("the paper's way", {T: f"paper-{T}" for T in plan.whole}),
+        curve("scanline", {plan.bands[0]: "scanline", plan.bands[-1]: "scanline"}),
     ]
 
 
@@ -151,6 +148,7 @@ def _memory(plan: Plan) -> list[Curve]:
     """Peak memory by T."""
     if not plan.memory_bands:
         return []
+    narrate("memory")
     scanline = render_mb(plan.size, None)
     fixed = f"{plan.size.gaussians} Gaussians, {plan.size.pixels} x {plan.size.pixels} px, forward and backward"
     bands = [Point(x=T, memory_mb=render_mb(plan.size, T)) for T in plan.memory_bands]
@@ -163,6 +161,7 @@ def _memory(plan: Plan) -> list[Curve]:
 
 def _frames(plan: Plan) -> Curve:
     """The training step by the number of frames, whose control points all belong to one optimiser."""
+    narrate("frames")
     way = _scanline(plan.size)
     points = [
         Point(x=frames, step_ms=median(_step(Training(plan.size, way, frames), plan.rounds))) for frames in plan.frames
@@ -173,6 +172,7 @@ def _frames(plan: Plan) -> Curve:
 
 def _steps(plan: Plan) -> dict[str, list[float]]:
     """The training step of the scanline, of bands with T = K, and of the paper's way, in turns."""
+    narrate("training steps")
     height = plan.size.pixels
     ways = {"scanline": _scanline(plan.size), "bands": in_bands(height, plan.K), "paper": paper(height, plan.K)}
     trainings = {name: Training(plan.size, way) for name, way in ways.items()}

@@ -88,7 +88,7 @@ def _growth(result: GrowthResult, folder: Path) -> list[str]:
 def _provenance(machine: Machine, command: str) -> str:
     return (
         f"`{command}` at commit {machine.commit} on {machine.processor}, {machine.cores} cores, "
-        f"{machine.threads} kernel threads, kernels built for {machine.instructions} ({machine.lanes} lanes); "
+        f"threads of the kernels: {machine.threads}, built for {machine.instructions} ({machine.lanes} lanes); "
         f"load {machine.load:g} at the start; Python {machine.python}, torch {machine.torch}.\n"
     )
 

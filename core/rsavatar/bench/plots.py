@@ -10,6 +10,7 @@ from rsavatar.bench.results import Curve, GrowthResult, RenderResult, WayFigures
 from rsavatar.bench.tables import AXES, MEASURES
 
 INK, GREY, BLUE, ORANGE, GREEN = "#222222", "#8a8a8a", "#2f6db3", "#d9772b", "#2c8f5c"
+COLOURS = {"bands": BLUE, "the paper's way": GREEN, "scanline, 1 thread": GREY}  # of curves; others are scanlines
 STEPS = ("own-time", "own-time+shear", "scanline")
 
 
@@ -79,8 +80,8 @@ def growth(result: GrowthResult, folder: Path) -> list[str]:
 
 def _growth(axis: str, curves: Sequence[Curve], folder: Path) -> str:
     figure, panel = _pyplot().subplots(figsize=(5.2, 4.0))
-    colours = (GREY, BLUE, ORANGE, GREEN)
-    for curve, colour in zip(curves, colours, strict=False):
+    for curve in curves:
+        colour = COLOURS.get(curve.name, ORANGE)
         for key, style in (("total_ms", "o-"), ("step_ms", "s--"), ("memory_mb", "o-")):
             known = [(p.x, getattr(p, key)) for p in curve.points if getattr(p, key) is not None]
             if known:

@@ -23,7 +23,7 @@ from rsavatar.bench.accuracy import compare, misaligned, order_of, over_seeds
 from rsavatar.bench.machine import describe
 from rsavatar.bench.results import Order, Ratio, RenderResult, SceneFacts, Target, WayFigures
 from rsavatar.bench.scene import MovingBody, Size, build
-from rsavatar.bench.timing import interleave, milliseconds, ratio
+from rsavatar.bench.timing import interleave, milliseconds, narrate, ratio
 from rsavatar.bench.truth import Truth, truth_of
 from rsavatar.bench.ways import Exposure, all_ways
 from rsavatar.render import reference
@@ -93,6 +93,7 @@ def measure(plan: Plan) -> RenderResult:
 
 def _at(motion: float, plan: Plan) -> _AtMotion:
     """Errors of all seeds and times of the first, at one speed."""
+    narrate(f"{motion:g} px of motion")
     sizes = [replace(plan.size, motion_px=motion, seed=seed) for seed in plan.seeds]
     bodies = [build(size) for size in sizes]
     truths = [truth_of(body, Options()) for body in bodies]
@@ -131,6 +132,7 @@ def _facts(size: Size, truth: Truth) -> SceneFacts:
 
 def _twin_ms(at: _AtMotion, plan: Plan) -> float:
     """Forward and backward of the torch twin on the same scene with the same gradients, once, float64."""
+    narrate("the torch twin")
     scanline = all_ways(plan.size.pixels, plan.K)[-1]
     twin = Exposure(at.body, scanline, misaligned(at.truth), render=reference.render)
     return milliseconds(twin.total)

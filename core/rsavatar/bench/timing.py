@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Mapping
 from statistics import median
@@ -23,6 +24,11 @@ def interleave(
             if name not in slow or turn < slow_rounds:
                 taken[name].append(milliseconds(action))
     return taken
+
+
+def narrate(stage: str) -> None:
+    """Say on stderr what is measured next: a benchmark takes minutes."""
+    print(f"bench: {stage}", file=sys.stderr, flush=True)
 
 
 def ratio(above: list[float], below: list[float]) -> float:
