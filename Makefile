@@ -2,13 +2,14 @@
 # make up     serve API, worker and page on http://127.0.0.1:8000 until stopped
 # make test   set up, run all tests
 # make check  format, lint, types, import contracts
+# make check-native  the kernels under address, undefined-behaviour and thread sanitizers
 # make bench  the long measurements; results in docs/benchmarks
 
 PYTHON ?= python3
 BIN := .venv/bin
 SETUP := .venv/.complete
 
-.PHONY: setup demo up test check bench clean
+.PHONY: setup demo up test check check-native bench clean
 .DEFAULT_GOAL := help
 
 help:
@@ -38,9 +39,13 @@ check: $(SETUP)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+check-native: $(SETUP)
+	$(BIN)/python -m tests.native.sanitize
+
 bench: $(SETUP)
 	$(BIN)/rsavatar bench render --json docs/benchmarks/render.json
 	$(BIN)/rsavatar bench train --json docs/benchmarks/train.json
+	$(BIN)/rsavatar bench stability --json docs/benchmarks/stability.json
 
 clean:
 	rm -rf .venv build core/*.egg-info core/rsavatar/render/_kernels_*.so
