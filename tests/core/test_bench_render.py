@@ -57,7 +57,7 @@ def test_a_scene_of_full_size_is_the_paper_s_problem() -> None:
     assert body.gaussians.count == 13_000
     assert (body.gaussians.skin_weights > 0).sum(0).max() <= 4
     assert torch.allclose(body.gaussians.skin_weights.sum(0), torch.ones(13_000))
-    image = native.render(body.scene(scan(1024, "scanline", "").slots, Options()))
+    image = native.render(body.scene(scan(1024).slots, Options()))
     # 157 000 px and 13 blended splats were asked for; a change of either changes what the figures mean
     assert 150_000 < int((image.transmittance < 1).sum()) < 170_000
 
@@ -89,7 +89,7 @@ def test_the_cache_gives_back_what_was_exposed(
 
 def test_rows_are_exposed_at_their_middles(body: MovingBody) -> None:
     offsets = body.row_offsets()
-    slot = scan(96, "scanline", "").slots[0]
+    slot = scan(96).slots[0]
     assert torch.allclose(slot.start + slot.rate * torch.arange(96.0).double(), offsets)
     assert torch.allclose(torch.tensor([s.start for s in in_bands(96, 96).slots], dtype=torch.float64), offsets)
     assert float(offsets[-1] - offsets[0]) == pytest.approx(READOUT * 95 / 96)

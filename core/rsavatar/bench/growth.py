@@ -104,7 +104,7 @@ def _point(x: float, size: Size, plan: Plan) -> Point:
 
 
 def _scanline(size: Size) -> Way:
-    return scan(size.pixels, "scanline", "scanline")
+    return scan(size.pixels)
 
 
 def _exposure(size: Size, way: Way) -> Exposure:

@@ -29,8 +29,8 @@ def _measure(size: Size, bands: int) -> float:
     body, pixels = build(size), size.pixels
     small = build(Size(200, 64))  # loads the libraries and whatever they allocate once
     ones = torch.ones(3, pixels, pixels), torch.ones(pixels, pixels)
-    Exposure(small, scan(64, "scanline", ""), (torch.ones(3, 64, 64), torch.ones(64, 64))).total()
-    shot = Exposure(body, in_bands(pixels, bands) if bands else scan(pixels, "scanline", ""), ones)
+    Exposure(small, scan(64), (torch.ones(3, 64, 64), torch.ones(64, 64))).total()
+    shot = Exposure(body, in_bands(pixels, bands) if bands else scan(pixels), ones)
     Path("/proc/self/clear_refs").write_text("5")  # resets the peak
     before = _status("VmRSS")
     for _ in range(3):

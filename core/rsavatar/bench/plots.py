@@ -11,7 +11,13 @@ from rsavatar.bench.tables import AXES, MEASURES
 
 INK, GREY, BLUE, ORANGE, GREEN = "#222222", "#8a8a8a", "#2f6db3", "#d9772b", "#2c8f5c"
 COLOURS = {"bands": BLUE, "the paper's way": GREEN, "scanline, 1 thread": GREY}  # of curves; others are scanlines
-STEPS = ("own-time", "own-time+shear", "scanline")
+STEPS = {  # of own time: name, and how far its label stands above its point
+    "own-time": ("own time", 0),
+    "own-time+shear": ("+ shear, implicit", 0),
+    "scanline": ("scanline", 0),
+    "scanline-5": ("fifth node", -3),
+    "scanline-5-fine": ("strips of 4 rows", -9),
+}
 
 
 def error_against_time(result: RenderResult, folder: Path) -> str:
@@ -34,10 +40,10 @@ def _error_panel(panel: Any, figures: Sequence[WayFigures]) -> None:
     panel.plot(*_places(bands), "o-", color=BLUE, markersize=4, linewidth=1.2)
     panel.plot(*_places(own), "s-", color=ORANGE, markersize=4, linewidth=1.2)
     panel.plot(*_places([at["paper"]]), "D", color=GREEN, markersize=6)
-    _say(panel, at["paper"], "the paper's way", GREEN, (-4, 8), "right")
+    _say(panel, at["paper"], "the paper's way", GREEN, (0, 9), "center")
     for f in bands:
         _say(panel, f, f"T = {f.bands}", BLUE, (5, 3), "left")
-    for f, text, rise in zip(own, ("own time", "+ shear, implicit", "scanline"), (0, 1, -8), strict=True):
+    for f, (text, rise) in zip(own, STEPS.values(), strict=True):
         _say(panel, f, text, ORANGE, (-6, rise), "right")
     panel.set_xscale("log")
     panel.set_yscale("log")

@@ -25,7 +25,7 @@ from rsavatar.bench.results import Order, Ratio, RenderResult, SceneFacts, Targe
 from rsavatar.bench.scene import MovingBody, Size, build
 from rsavatar.bench.timing import interleave, milliseconds, narrate, ratio
 from rsavatar.bench.truth import Truth, truth_of
-from rsavatar.bench.ways import Exposure, all_ways
+from rsavatar.bench.ways import Exposure, all_ways, scan
 from rsavatar.render import reference
 from rsavatar.render.base import Options
 
@@ -74,16 +74,16 @@ def measure(plan: Plan) -> RenderResult:
     machine = describe()
     found = {motion: _at(motion, plan) for motion in plan.motions_px}
     main_motion = found[plan.main_px]
-    twin_ms = _twin_ms(main_motion, plan) if plan.twin else None
+    twin = _twin(main_motion, plan) if plan.twin else None
     ways = [figures for at in found.values() for figures in at.ways]
-    ratios = _ratios(main_motion.taken, plan, twin_ms)
+    ratios = _ratios(main_motion.taken, plan, twin)
     return RenderResult(
         machine=machine,
         command="rsavatar bench render --json docs/benchmarks/render.json",
         scene=main_motion.facts,
         main_px=plan.main_px,
         seeds=list(plan.seeds),
-        twin_ms=twin_ms,
+        twin_ms=twin[0] if twin else None,
         ways=ways,
         ratios=ratios,
         orders=[at.order for at in found.values()],
@@ -130,15 +130,21 @@ def _facts(size: Size, truth: Truth) -> SceneFacts:
     )
 
 
-def _twin_ms(at: _AtMotion, plan: Plan) -> float:
-    """Forward and backward of the torch twin on the same scene with the same gradients, once, float64."""
+def _twin(at: _AtMotion, plan: Plan) -> tuple[float, float]:
+    """Forward and backward of the torch twin on the same scene with the same gradients, float64.
+
+    Once, between rounds of the kernels: returns its time, and by how much theirs is shorter.
+    """
     narrate("the torch twin")
-    scanline = all_ways(plan.size.pixels, plan.K)[-1]
-    twin = Exposure(at.body, scanline, misaligned(at.truth), render=reference.render)
-    return milliseconds(twin.total)
+    scanline, upstream = scan(plan.size.pixels), misaligned(at.truth)
+    twin, kernel = Exposure(at.body, scanline, upstream, reference.render), Exposure(at.body, scanline, upstream)
+    before = interleave({"kernels": kernel.total}, plan.rounds)["kernels"]
+    taken = milliseconds(twin.total)
+    after = interleave({"kernels": kernel.total}, plan.rounds)["kernels"]
+    return taken, taken / median(before + after)
 
 
-def _ratios(taken: Taken, plan: Plan, twin_ms: float | None) -> list[Ratio]:
+def _ratios(taken: Taken, plan: Plan, twin: tuple[float, float] | None) -> list[Ratio]:
     K, H = plan.K, plan.size.pixels
     pairs = [
         ("scanline", "global"),
@@ -148,8 +154,8 @@ def _ratios(taken: Taken, plan: Plan, twin_ms: float | None) -> list[Ratio]:
         (f"bands-{H}", "scanline"),
     ]
     found = [Ratio(above=a, below=b, value=ratio(taken[a], taken[b])) for a, b in pairs]
-    if twin_ms is not None:
-        found.append(Ratio(above="torch twin", below="scanline", value=twin_ms / median(taken["scanline"])))
+    if twin is not None:
+        found.append(Ratio(above="torch twin", below="scanline", value=twin[1]))
     return found
 
 

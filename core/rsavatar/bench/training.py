@@ -83,7 +83,7 @@ def _observe(body: MovingBody, way: Way) -> Observation:
     """The body's image as bytes, cut to its mask, with the way's slots planned for the cut."""
     height, width = body.camera.height, body.camera.width
     with torch.no_grad():
-        image = expose(body.scene(scan(height, "scanline", "").slots, Options()))
+        image = expose(body.scene(scan(height).slots, Options()))
     rgb = (255 * image.rgb.clamp(0, 1)).round().byte()
     mask = (255 * (1 - image.transmittance)).round().byte()
     x0, y0, x1, y1 = body_box(mask.numpy()) or (0, 0, width, height)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import torch
 from torch import Tensor
 
 from rsavatar.bench.scene import READOUT, MovingBody
+from rsavatar.imaging import NODES
 from rsavatar.render import native
 from rsavatar.render.base import Correction, Gaussians, Options, Rendering, Scene
 from rsavatar.shutter.base import Slot
@@ -17,12 +18,13 @@ from rsavatar.shutter.rolling import Bands, Instant, Scanline
 
 @dataclass(frozen=True)
 class Way:
-    """Slots, what is left out of own time; ``bands``: T of a way in bands, 0 for others."""
+    """Slots, and how they are rendered; ``bands``: T of a way in bands, 0 for others."""
 
     name: str
     label: str
     slots: tuple[Slot, ...]
-    without: frozenset[Correction] = frozenset()
+    options: Options = field(default_factory=Options)
+    nodes: int = NODES  # of a scanned slot's pose polynomial
     bands: int = 0
     whole: bool = False  # each slot is rendered as an image of its own, of which its rows are taken
 
@@ -43,14 +45,19 @@ def paper(height: int, bands: int) -> Way:
     return replace(in_bands(height, bands), name="paper", label=label, whole=True, bands=0)
 
 
-def scan(height: int, name: str, label: str, *without: Correction) -> Way:
+def scan(height: int, name: str = "scanline", label: str = "scanline", *without: Correction) -> Way:
     """Each Gaussian at its own time. Rows are exposed at their middles, as the bands' limit is (``MovingBody``)."""
     slots = Scanline().slots(height, READOUT, READOUT / height / 2)
-    return Way(name, label, slots, frozenset(without))
+    return Way(name, label, slots, Options(without=frozenset(without)))
 
 
 def all_ways(height: int, K: int) -> list[Way]:
-    """Every way for K source frames per frame: T = 1, the paper's, bands from K to H, and own time in three steps."""
+    """Every way for K source frames per frame: T = 1, the paper's, bands from K to H, and own time step by step.
+
+    The last two spend more than the default scanline does: a fifth pose node, then a depth order every 4 rows.
+    """
+    fifth = replace(scan(height, "scanline-5", "+ a fifth pose node"), nodes=5)
+    fine = replace(fifth, name="scanline-5-fine", label="+ strips of 4 rows", options=Options(strip_rows=4))
     finer = sorted({min(T, height) for T in (K, 2 * K, 4 * K, 16 * K, height)})
     return [
         global_shutter(height),
@@ -59,6 +66,8 @@ def all_ways(height: int, K: int) -> list[Way]:
         scan(height, "own-time", "own time only", "shear", "implicit", "resort"),
         scan(height, "own-time+shear", "+ shear, implicit derivative", "resort"),
         scan(height, "scanline", "+ depth re-sort (scanline)"),
+        fifth,
+        fine,
     ]
 
 
@@ -85,7 +94,7 @@ class Exposure:
         render: Callable[[Scene], Rendering] = native.render,
     ) -> None:
         """``upstream``: gradients [3, H, W] and [H, W], float32, that every backward starts from."""
-        scene = body.scene(way.slots, Options(without=way.without))
+        scene = body.scene(way.slots, way.options, way.nodes)
         self._control = body.motion.control
         self._pose = scene.pose  # a function of the control points
         leaves = {f.name: getattr(scene.gaussians, f.name).detach().requires_grad_() for f in fields(Gaussians)}
