@@ -18,7 +18,7 @@ from rsavatar.motion.base import Continuity
 
 BLOCK = 50  # steps between refreshes of the skinning weights; all that saves state happens between blocks
 MOST_REJECTED = 50  # rejected steps in a row before training is called diverged
-FAR = 4.0  # times the best block's mean loss: diverged. Sound runs, density control included, stayed within twice
+FAR = 3.0  # times the best block's mean loss: diverged. Sound runs, density control included, stayed within twice
 
 
 @dataclass(frozen=True)

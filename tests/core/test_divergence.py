@@ -30,7 +30,7 @@ def test_a_block_far_above_the_best_is_divergence_and_one_below_the_limit_is_not
         state.losses = [mean] * 50
         state.close_block(actor)
     state.losses = [0.1 * FAR + 1e-3] * 50
-    with pytest.raises(DivergedError, match=r"diverged at step 0: mean loss: expected at most 4 times"):
+    with pytest.raises(DivergedError, match=r"diverged at step 0: mean loss: expected at most 3 times"):
         state.close_block(actor)
 
 

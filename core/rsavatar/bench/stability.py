@@ -25,6 +25,7 @@ from rsavatar.bench.stability_case import Case
 
 GROUPS = {"renderer": "stability_scenes", "numbers and refusals": "stability_numbers", "training": "stability_training"}
 COMMAND = "rsavatar bench stability"
+THREADS = 2
 
 
 @dataclass(frozen=True)
@@ -41,8 +42,9 @@ class Row:
 
 def main(json_path: Path | None) -> int:
     """Run all groups; print the table, write it as JSON and, beside that, as a page. Status 1 where a promise broke."""
-    rows = [row for group in GROUPS for row in run(group)]
+    kernels.use_threads(THREADS)
     machine = describe()
+    rows = [row for group in GROUPS for row in run(group)]
     _print(rows)
     if json_path:
         found = {
@@ -75,7 +77,7 @@ def run(group: str) -> Iterator[Row]:
 
 def _serve(group: str, outbox: Connection) -> None:
     torch.set_num_threads(1)
-    kernels.use_threads(2)
+    kernels.use_threads(THREADS)
     cases: list[Case] = import_module(f"rsavatar.bench.{GROUPS[group]}").cases()
     for case in cases:
         begun = time.perf_counter()
