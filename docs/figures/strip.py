@@ -15,12 +15,18 @@ import cv2
 import numpy as np
 
 from rsavatar.data.catalogue import open_subject
-from rsavatar.methods.base import body_box
 
 HEIGHT, GAIN = 420, 3.0
 
 
+def tight(mask: np.ndarray) -> tuple[int, int, int, int]:
+    """Columns and rows of the body with a few pixels around it."""
+    x, y, width, height = cv2.boundingRect(cv2.findNonZero(mask))
+    return max(x - 6, 0), max(y - 4, 0), x + width + 6, y + height + 4
+
+
 def tile(image: np.ndarray, box: tuple[int, int, int, int], caption: str) -> np.ndarray:
+    """The box of an image, enlarged, with its caption under it."""
     x0, y0, x1, y1 = box
     cut = image[y0:y1, x0:x1]
     big = cv2.resize(cut, (round(cut.shape[1] * HEIGHT / cut.shape[0]), HEIGHT), interpolation=cv2.INTER_CUBIC)
@@ -31,16 +37,15 @@ def tile(image: np.ndarray, box: tuple[int, int, int, int], caption: str) -> np.
 
 
 def main() -> None:
+    """Read the arguments, write the strip."""
     root, camera, frame, out, *runs = sys.argv[1:]
     subject, n = open_subject(Path(root).name, Path(root)), int(frame)
     truth, mask = subject.truth(camera, n)
-    box = body_box(mask)
+    box = tight(mask)
     here = subject.cameras[camera].centre
     nearest = min(subject.training, key=lambda c: float(np.linalg.norm(subject.cameras[c].centre - here)))
     seen, seen_mask = subject.observe(nearest, n)
-    seen_box = body_box(seen_mask)
-    assert box is not None
-    assert seen_box is not None
+    seen_box = tight(seen_mask)
     tiles = [tile(seen, seen_box, "rolling shutter (input)")]
     for name, folder in (run.split("=", 1) for run in runs):
         image = cv2.imread(str(Path(folder) / "predictions" / camera / f"{n:06d}.png"))[..., ::-1]

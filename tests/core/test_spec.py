@@ -101,7 +101,8 @@ def test_equal_words_in_another_order_are_the_same_job() -> None:
 def test_the_hash_ignores_priority_and_nothing_else() -> None:
     changes: dict[str, Any] = {
         "method": "gauhuman", "subject": "walk", "K": 7, "T": 5, "P": 3, "lambda": 2.0, "seed": 1, "iterations": 5,
-        "preset": "smoke", "body": "anny", "motion": "frame-spline", "regime": "authors", "continuity": "paper", "perturbation": "positive", "sh_degree": 0,
+        "preset": "smoke", "body": "anny", "motion": "frame-spline",
+        "regime": "authors", "continuity": "paper", "perturbation": "positive", "sh_degree": 0,
         "mask_weight": 0.25, "densify": False, "checkpoint_every": 7, "ablation": {"no_rs": True},
     }  # fmt: skip
     names = {field.alias or name for name, field in JobSpec.model_fields.items()}
