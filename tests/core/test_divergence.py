@@ -26,7 +26,7 @@ def test_a_block_far_above_the_best_is_divergence_and_one_below_the_limit_is_not
     job = case()
     actor = build_actor(RollingShutterAvatar(), job)
     state = State(actor, settings(job))
-    for mean in (0.2, 0.1, 0.1 * FAR):
+    for mean in (0.2, 0.1, 0.099 * FAR):
         state.losses = [mean] * 50
         state.close_block(actor)
     state.losses = [0.1 * FAR + 1e-3] * 50
