@@ -11,12 +11,12 @@ from rsavatar.bench.tables import AXES, MEASURES
 
 INK, GREY, BLUE, ORANGE, GREEN = "#222222", "#8a8a8a", "#2f6db3", "#d9772b", "#2c8f5c"
 COLOURS = {"bands": BLUE, "the paper's way": GREEN, "scanline, 1 thread": GREY}  # of curves; others are scanlines
-STEPS = {  # of own time: name, and how far its label stands above its point
-    "own-time": ("own time", 0),
-    "own-time+shear": ("+ shear, implicit", 0),
-    "scanline": ("scanline", 0),
-    "scanline-5": ("fifth node", -3),
-    "scanline-5-fine": ("strips of 4 rows", -9),
+STEPS: dict[str, tuple[str, tuple[int, int], str]] = {  # of own time: label, its shift in points, its alignment
+    "own-time": ("own time", (-6, 0), "right"),
+    "own-time+shear": ("+ shear, implicit", (-6, 0), "right"),
+    "scanline": ("scanline", (-6, 0), "right"),
+    "scanline-5": ("fifth node", (7, 2), "left"),
+    "scanline-5-fine": ("strips of 4 rows", (7, -10), "left"),
 }
 
 
@@ -43,8 +43,8 @@ def _error_panel(panel: Any, figures: Sequence[WayFigures]) -> None:
     _say(panel, at["paper"], "the paper's way", GREEN, (0, 9), "center")
     for f in bands:
         _say(panel, f, f"T = {f.bands}", BLUE, (5, 3), "left")
-    for f, (text, rise) in zip(own, STEPS.values(), strict=True):
-        _say(panel, f, text, ORANGE, (-6, rise), "right")
+    for f, (text, shift, side) in zip(own, STEPS.values(), strict=True):
+        _say(panel, f, text, ORANGE, shift, side)
     panel.set_xscale("log")
     panel.set_yscale("log")
     panel.margins(x=0.35, y=0.08)
@@ -93,6 +93,12 @@ def _growth(axis: str, curves: Sequence[Curve], folder: Path) -> str:
             if known:
                 label = f"{curve.name}: {MEASURES[key].rsplit(' ', 1)[0]}"
                 panel.loglog(*zip(*known, strict=True), style, color=colour, markersize=4, linewidth=1.2, label=label)
+    places = sorted({p.x for curve in curves for p in curve.points})
+    panel.set_xticks(places, [f"{x:g}" for x in places], fontsize=7.5)
+    panel.xaxis.minorticks_off()
+    low, high = panel.get_ylim()
+    if high < 10 * low:  # a decade at least, so that what is nearly flat looks so
+        panel.set_ylim(low / 2, high * 10 / (high / low))
     panel.legend(fontsize=7.5, frameon=False)
     panel.set_xlabel(AXES[axis])
     panel.set_ylabel("peak MB" if axis == "memory" else "ms")
