@@ -82,7 +82,10 @@ class BuildKernels(build_ext):
     def copy_extensions_to_source(self) -> None:
         """Of an in-place or editable build."""
         for library in self.folder.glob("_kernels_*.so"):
-            shutil.copy2(library, ROOT / "core/rsavatar/render")
+            place = ROOT / "core/rsavatar/render" / library.name
+            fresh = place.with_suffix(".new")
+            shutil.copy2(library, fresh)
+            fresh.replace(place)  # a running job keeps the library that it has loaded
 
 
 class BuildPackage(build_py):

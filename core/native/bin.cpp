@@ -105,12 +105,17 @@ void bin(RsFrame &frame, int index, int count) {
     int n = slot.ids.size(), lo = slot.rows.lo, height = frame.options.strip_rows;
     slot.splats.resize(n), slot.rank.resize(n), slot.first_pair.resize(n + 1);
     slot.strip_begin.assign(slot.strips + 1, 0);
+    slot.strip_x_lo.assign(slot.strips, MAX_SIZE), slot.strip_x_hi.assign(slot.strips, 0);
     int64_t pairs = 0;
     for (int k = 0; k < n; k++) {
         const Splat s = slot.splats[k] = pack(frame, slot, p, slot.order[k]);
         slot.rank[slot.order[k]] = k, slot.first_pair[k] = pairs;
         if (s.y_lo >= s.y_hi || s.x_lo >= s.x_hi) continue;
-        for (int strip = (s.y_lo - lo) / height; strip <= (s.y_hi - 1 - lo) / height; strip++) slot.strip_begin[strip + 1]++, pairs++;
+        for (int strip = (s.y_lo - lo) / height; strip <= (s.y_hi - 1 - lo) / height; strip++, pairs++) {
+            slot.strip_begin[strip + 1]++;
+            slot.strip_x_lo[strip] = std::min(slot.strip_x_lo[strip], s.x_lo);
+            slot.strip_x_hi[strip] = std::max(slot.strip_x_hi[strip], s.x_hi);
+        }
     }
     if (pairs > INT32_MAX) throw std::bad_alloc();  // 128 GiB of moments
     slot.first_pair[n] = pairs;

@@ -38,6 +38,7 @@ struct Slot {
     std::vector<Splat> splats;         // by depth
     std::vector<int32_t> first_pair;   // splat -> its first pair; a splat's pairs are its strips, from the top; [n + 1]
     std::vector<int32_t> strip_begin;  // strip -> its first entry; [strips + 1]
+    std::vector<int16_t> strip_x_lo, strip_x_hi;  // columns that the strip's splats reach
     std::vector<int32_t> entry_splat, entry_pair;  // the strips' lists, by depth
     std::vector<float> moments;        // [pairs][16], written by the backward raster
     std::vector<float> scratch;        // [FIELDS][stride]

@@ -2,29 +2,39 @@
 #pragma once
 #include "frame.h"
 
-// LANES Gaussian ids; loads are direct where the ids are consecutive and gathered where they are not.
+// LANES Gaussians. Mostly a window of consecutive ids, read and written as vectors, whose lanes need not all be alive;
+// where survivors are sparse, the next survivors, gathered.
 struct Block {
-    int32_t ids[LANES];
-    int count;  // lanes in use; the others repeat the last id
-    bool consecutive;
+    int32_t ids[LANES], survivors[LANES];  // survivors: index into Slot::ids, of lanes that are alive
+    Ints live;
+    int used;  // survivors taken from the list
+    bool window;
 
-    Block(const int32_t *list, int n) : count(n < LANES ? n : LANES) {
-        for (int i = 0; i < LANES; i++) ids[i] = list[i < count ? i : count - 1];
-        consecutive = count == LANES && ids[LANES - 1] - ids[0] == LANES - 1;
+    Block(int first, int count) : live(Ints{} - 1), used(0), window(first + LANES <= count) {  // all of [first, count)
+        for (int i = 0; i < LANES; i++) ids[i] = first + i < count ? first + i : count - 1;
     }
-    Block(int first, int n) : count(n < LANES ? n : LANES) {
-        for (int i = 0; i < LANES; i++) ids[i] = first + (i < count ? i : count - 1);
-        consecutive = count == LANES;
+    // Of the survivors list[first, last), as many as fit; `count` Gaussians in all.
+    Block(const int32_t *list, int first, int last, int count) : live{}, used(0) {
+        const int half = LANES / 2;
+        window = first + half <= last && list[first + half - 1] - list[first] < LANES && list[first] + LANES <= count;
+        for (; used < LANES && first + used < last; used++) {
+            const int lane = window ? list[first + used] - list[first] : used;
+            if (lane >= LANES) break;
+            live[lane] = -1, survivors[lane] = first + used, ids[lane] = list[first + used];
+        }
+        for (int i = 0; i < LANES; i++)
+            if (window) ids[i] = list[first] + i;
+            else if (!live[i]) ids[i] = ids[0];
     }
     Floats get(const float *p) const {
-        if (consecutive) return load(p + ids[0]);
+        if (window) return load(p + ids[0]);
         Floats v;
         for (int i = 0; i < LANES; i++) v[i] = p[ids[i]];
         return v;
     }
     void add(float *p, Floats v) const {
-        if (consecutive) return store(p + ids[0], load(p + ids[0]) + v);
-        for (int i = 0; i < count; i++) p[ids[i]] += v[i];
+        if (window) return store(p + ids[0], load(p + ids[0]) + keep(live, v));
+        for (int i = 0; i < used; i++) p[ids[i]] += v[i];
     }
 };
 

@@ -52,7 +52,7 @@ static void project_block(const RsFrame &frame, const RsGaussians &g, const floa
     const RsCamera &cam = frame.camera;
     const RsOptions &o = frame.options;
     int D = frame.coefficients;
-    Block block(first, g.count - first);
+    Block block(first, g.count);
     Blend blend;
     blend_pose(block, g, pose, D, blend);
     Vec3 x = mean_of(block, g);
@@ -99,19 +99,21 @@ struct SplatGradient {
     Floats u, v, A, tilt, S, logit, colour[3];  // log alpha = -(A (dx + tilt dy)^2 + S dy^2) / 2
 };
 
-// Sums the moments of a splat's strips, in order, for LANES survivors of a slot.
-static bool gather_moments(const Slot &slot, int first, int count, float out[MOMENTS][LANES]) {
-    bool seen = false;
-    memset(out, 0, sizeof(float) * MOMENTS * LANES);
-    for (int lane = 0; lane < count; lane++) {
-        int k = slot.rank[first + lane];
-        for (int pair = slot.first_pair[k]; pair < slot.first_pair[k + 1]; pair++)
-            for (int m = 0; m < MOMENTS; m++) {
-                float x = slot.moments[(size_t)pair * 16 + m];
-                out[m][lane] += x, seen |= x != 0.f;
-            }
+// Sums the moments of each lane's splat over its strips, in order. False where nothing of the block reached a pixel.
+static bool gather_moments(const Slot &slot, const Block &block, float out[MOMENTS][LANES]) {
+    constexpr int WIDTH = 16 / LANES;  // vectors in a pair's row of 16
+    Ints seen = {};
+    for (int lane = 0; lane < LANES; lane++) {
+        Floats sums[WIDTH] = {};
+        if (block.live[lane]) {
+            const int k = slot.rank[block.survivors[lane]];
+            for (int pair = slot.first_pair[k]; pair < slot.first_pair[k + 1]; pair++)
+                for (int i = 0; i < WIDTH; i++) sums[i] += load(&slot.moments[(size_t)pair * 16 + i * LANES]);
+        }
+        for (int i = 0; i < WIDTH; i++) seen |= sums[i] != 0.f;
+        for (int m = 0; m < MOMENTS; m++) out[m][lane] = sums[m / LANES][m % LANES];
     }
-    return seen;
+    return any(seen);
 }
 
 static SplatGradient splat_gradient(const float m[MOMENTS][LANES], Floats A, Floats tilt, Floats S, Floats opacity) {
@@ -223,11 +225,11 @@ static void through_own_time(const Posed &p, const Blend &blend, int D, Floats t
 // B(tau) = sum_d tau^d sum_j w_j pose[d, j]: to the weights and to the pose's running sums [D][24][12]. Joints that move
 // no Gaussian of the block are skipped, so a weight of 0 gets no gradient.
 static void through_blend(const Block &block, const RsGaussians &g, const RsGradients &out, const float *pose, int D, Floats tau,
-                          Ints live, const TransformGradient &t, Floats *sums) {
+                          const TransformGradient &t, Floats *sums) {
     Floats of[MAX_COEFFICIENTS][12];  // dL / d (sum_j w_j pose[d, j])
     Floats power = splat(1.f), power_rate = {};  // tau^d and d tau^(d-1)
     for (int d = 0; d < D; d++) {
-        for (int m = 0; m < 12; m++) of[d][m] = keep(live, power * t.B[m] + power_rate * t.Bd[m]);
+        for (int m = 0; m < 12; m++) of[d][m] = keep(block.live, power * t.B[m] + power_rate * t.Bd[m]);
         power_rate = power * (float)(d + 1), power *= tau;
     }
     for (int j = 0; j < JOINTS; j++) {
@@ -246,16 +248,15 @@ static void through_blend(const Block &block, const RsGaussians &g, const RsGrad
 }
 
 static void backward_block(const RsFrame &frame, const RsGaussians &g, const RsGradients &out, const float *pose, const Slot &slot,
-                           int first, int count, Floats *sums) {
-    float moments[MOMENTS][LANES];
-    if (!gather_moments(slot, first, count, moments)) return;  // nothing of these reached a pixel
+                           const Block &block, Floats *sums) {
+    alignas(64) float moments[MOMENTS][LANES];
+    if (!gather_moments(slot, block, moments)) return;
     const RsCamera &cam = frame.camera;
     int D = frame.coefficients;
     float rate = slot.rows.rate;
-    Block block(slot.ids.data() + first, count);
-    Floats tau;
-    Ints live;
-    for (int i = 0; i < LANES; i++) tau[i] = slot.tau[first + (i < count ? i : count - 1)], live[i] = i < count ? -1 : 0;
+    Floats tau = {};
+    for (int i = 0; i < LANES; i++)
+        if (block.live[i]) tau[i] = slot.tau[block.survivors[i]];
     Blend blend;
     blend_pose(block, g, pose, D, blend);
     Vec3 x = mean_of(block, g);
@@ -295,7 +296,7 @@ static void backward_block(const RsFrame &frame, const RsGaussians &g, const RsG
     const Floats *l0 = &L.r[0].x, *l1 = &L.r[1].x, *l2 = &L.r[2].x;
     for (int k = 0; k < 3; k++) gRS.r[k] = pg.M.r[0] * l0[k] + pg.M.r[1] * l1[k] + pg.M.r[2] * l2[k];
     rotation_and_scale(block, g, out, f, gRS);
-    through_blend(block, g, out, pose, D, tau, live, t, sums);
+    through_blend(block, g, out, pose, D, tau, t, sums);
 }
 
 // Chunks of Gaussian ids, as many for one thread as for sixty: each chunk walks all slots in order and owns its rows of
@@ -317,8 +318,11 @@ void project_backward(RsFrame &frame, const RsGaussians &g, const float *pose, c
             int last = std::lower_bound(slot.ids.begin() + first, slot.ids.end(), end) - slot.ids.begin();
             if (first == last) continue;
             std::fill(sums.begin(), sums.end(), Floats{});
-            for (int k = first; k < last; k += LANES)
-                backward_block(frame, g, out, pose + t * n, slot, k, std::min(LANES, last - k), sums.data());
+            for (int k = first; k < last;) {
+                const Block block(slot.ids.data(), k, last, end);
+                backward_block(frame, g, out, pose + t * n, slot, block, sums.data());
+                k += block.used;
+            }
             if (out.pose)
                 for (size_t i = 0; i < n; i++) frame.pose_sums[(chunk * (size_t)T + t) * n + i] = sum(sums[i]);
         }

@@ -24,11 +24,7 @@ enum { REST_PLANE = 1, GR_PLANE, GG_PLANE, GB_PLANE, BACKWARD_PLANES };         
 static Canvas open_canvas(const RsFrame &frame, const Slot &slot, int strip, int planes, std::vector<float> &buffer) {
     Canvas c;
     c.r0 = slot.rows.lo + strip * frame.options.strip_rows, c.r1 = std::min(c.r0 + frame.options.strip_rows, slot.rows.hi);
-    c.x0 = frame.camera.width, c.x1 = 0;
-    for (int e = slot.strip_begin[strip]; e < slot.strip_begin[strip + 1]; e++) {
-        const Splat &s = slot.splats[slot.entry_splat[e]];
-        c.x0 = std::min<int>(c.x0, s.x_lo), c.x1 = std::max<int>(c.x1, s.x_hi);
-    }
+    c.x0 = slot.strip_x_lo[strip], c.x1 = slot.strip_x_hi[strip];
     if (c.x0 >= c.x1) c.x0 = c.x1 = 0;
     c.plane = (c.x1 - c.x0 + 2 * LANES - 1) / LANES * LANES;  // a vector may start at the last column
     c.row = c.plane * planes;
