@@ -39,7 +39,7 @@ class Rates:
 
 # Four views cannot tell a displaced limb from displaced Gaussians, nor a limb from its visual hull. So the motion moves
 # first, and the Gaussians stay where the body puts them, too small to stick out of it between two views.
-POSE_FIRST = Rates(means=3e-5, motion=3e-3, largest=0.010)
+POSE_FIRST = Rates(means=3e-5, motion=2e-3, largest=0.010)
 
 
 @dataclass(frozen=True)
