@@ -29,7 +29,7 @@ class Settings(BaseSettings):
     broker_url: str = Field(default="", description="redis URL; empty = a private server on a unix socket in the home")
     redis_server: Path | None = Field(default=None, description="binary of the private server; none = look for one")
     subject_roots: Annotated[tuple[Path, ...], NoDecode] = Field(
-        default=(), description="folders that may hold subjects"
+        default=(), description="folders that hold subjects: those found are registered"
     )
 
     host: str = Field(default="127.0.0.1", description="address that the API binds")

@@ -32,6 +32,7 @@ def create_app(settings: Settings) -> FastAPI:
     """
     store = Store(settings)
     schema.require_head(store)
+    subjects.discover(store, settings.subject_roots)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:

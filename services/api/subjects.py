@@ -6,14 +6,16 @@ from pathlib import Path
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
+from pydantic import ValidationError
 
 from services.api.deps import Back
 from services.api.requests import SubjectRequest
 from services.api.views import SubjectView
-from services.errors import RequestError
+from services.errors import ConflictError, RequestError
 from services.settings import LOOPBACK, Settings
 from services.store import subjects
 from services.store.records import Subject
+from services.store.session import Store
 
 router = APIRouter(prefix="/subjects", tags=["subjects"])
 
@@ -50,6 +52,17 @@ def allowed_path(settings: Settings, text: str, *, is_operator: bool) -> Path:
     if not (inside or is_operator) or not path.is_dir():
         raise RequestError("path", wanted, repr(text))
     return path
+
+
+def discover(store: Store, roots: tuple[Path, ...]) -> None:
+    """Register every subject that lies directly in a root, by its folder's name. A name that is taken stays as it is."""
+    for folder in sorted(path for root in roots if root.is_dir() for path in root.resolve().iterdir()):
+        try:
+            body = SubjectRequest(name=folder.name, path=str(folder))
+            kind, info = inspect(folder)
+            subjects.add(store, Subject(body.name, body.path, kind, info))
+        except (ValidationError, RequestError, ConflictError):
+            continue  # not a subject, not a name, or another's name
 
 
 def inspect(path: Path) -> tuple[str, dict[str, Any]]:

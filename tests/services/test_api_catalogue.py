@@ -68,6 +68,13 @@ def test_off_loopback_only_the_roots_count(settings: Settings, store: Store, sub
         assert client.post("/api/v1/subjects", json={"name": "x", "path": str(subject)}).status_code == 201
 
 
+def test_what_lies_in_a_root_is_known_from_the_start(settings: Settings, store: Store, subject: Path) -> None:
+    (subject.parent / "notes").mkdir()
+    (subject.parent / "not a name").symlink_to(subject)
+    with serving(settings.model_copy(update={"subject_roots": (subject.parent,)})) as client:
+        assert [s["name"] for s in client.get("/api/v1/subjects").json()] == ["studio", subject.name]
+
+
 def test_tables_in_every_format(client: httpx.Client, store: Store) -> None:
     for method in ("gauhuman", "rs-avatar"):
         post(client, method=method)
