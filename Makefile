@@ -44,6 +44,7 @@ check-native: $(SETUP)
 
 bench: $(SETUP)
 	$(BIN)/rsavatar bench render --json docs/benchmarks/render.json
+	$(BIN)/rsavatar bench growth --json docs/benchmarks/growth.json
 	$(BIN)/rsavatar bench train --json docs/benchmarks/train.json
 	$(BIN)/rsavatar bench stability --json docs/benchmarks/stability.json
 

@@ -55,7 +55,7 @@ def allowed_path(settings: Settings, text: str, *, is_operator: bool) -> Path:
 
 
 def discover(store: Store, roots: tuple[Path, ...]) -> None:
-    """Register every subject that lies directly in a root, by its folder's name. A name that is taken stays as it is."""
+    """Register every subject that lies directly in a root, by its folder's name; a name that is taken stays."""
     for folder in sorted(path for root in roots if root.is_dir() for path in root.resolve().iterdir()):
         try:
             body = SubjectRequest(name=folder.name, path=str(folder))
