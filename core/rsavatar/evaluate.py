@@ -74,7 +74,7 @@ def _score_views(
             if not cv2.imwrite(str(path), pixels[..., ::-1]):
                 raise DataError(expected(str(path), "a writable file", "no success"))
             truth, mask = subject.truth(name, frame)
-            values = score(_unit(pixels), _unit(truth), mask > 0) if mask.any() else {}
+            values = score(unit(pixels), unit(truth), mask > 0) if mask.any() else {}
             scores.append(Score(name, frame, values))
             report(Progress("evaluate", len(scores), total, watch.seconds, psnr=values.get("psnr")))
     return scores
@@ -92,7 +92,8 @@ def render_view(
     return pixels
 
 
-def _unit(pixels: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+def unit(pixels: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+    """Bytes to [0, 1]."""
     return pixels.astype(np.float32) / np.float32(255)
 
 

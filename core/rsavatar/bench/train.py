@@ -1,7 +1,7 @@
 """``rsavatar bench train``: held-out PSNR against the seconds of training, for each method at one budget.
 
 Trains the draft preset on the subject in RSAVATAR_BENCH_SUBJECT (a folder), or on the built-in one. Looking at the
-held-out views is not counted as training. The figures are those of a run that nobody watches: looking changes no number.
+held-out views is not counted as training, and changes no number of it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rsavatar.body.find import find_body
 from rsavatar.checkpoint import Owner
 from rsavatar.data.base import Subject
 from rsavatar.data.catalogue import open_subject
-from rsavatar.evaluate import render_view
+from rsavatar.evaluate import render_view, unit
 from rsavatar.events import Event, Progress
 from rsavatar.imaging import Actor
 from rsavatar.methods.base import AbstractMethod, Case, build_actor, observations, settings
@@ -97,7 +97,7 @@ class Watch:
                 image = render_view(self.actor, self.subject, camera, frame, weights, 1)
                 truth, mask = self.subject.truth(camera, frame)
                 if mask.any():
-                    values.append(psnr(np.float32(image) / 255, np.float32(truth) / 255, dilate(mask > 0)))
+                    values.append(psnr(unit(image), unit(truth), dilate(mask > 0)))
         return float(np.mean(values))
 
 
