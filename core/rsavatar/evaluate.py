@@ -111,6 +111,27 @@ def mean_scores(scores: tuple[Score, ...]) -> dict[str, float | None]:
     return means
 
 
+def write_preview(scores: tuple[Score, ...], subject: Subject, out: Path) -> tuple[Path, str] | None:
+    """The view of median PSNR beside its truth and their difference, ``out/preview.png``; None without held-out views.
+
+    Returns:
+        The file and a caption for it.
+    """
+    ranked = sorted((s for s in scores if s.values.get("psnr") is not None), key=lambda s: s.values["psnr"] or 0.0)
+    if not ranked:
+        return None
+    chosen = ranked[len(ranked) // 2]
+    image = cv2.imread(str(out / "predictions" / chosen.camera / f"{chosen.frame:06d}.png"))
+    truth, mask = subject.truth(chosen.camera, chosen.frame)
+    x, y, width, height = cv2.boundingRect(mask)
+    box = np.s_[max(y - 8, 0) : y + height + 8, max(x - 8, 0) : x + width + 8]
+    tiles = [image[box], truth[..., ::-1][box], cv2.convertScaleAbs(cv2.absdiff(image, truth[..., ::-1])[box], alpha=3)]
+    path = out / "preview.png"
+    cv2.imwrite(str(path), np.hstack(tiles))
+    psnr = chosen.values["psnr"]
+    return path, f"camera {chosen.camera}, frame {chosen.frame}: reconstruction, truth, difference x3 ({psnr:.1f} dB)"
+
+
 def recovered_motion(actor: Actor, subject: Subject) -> dict[str, Array]:
     """The motion in the body fit's words, refined poses included: see ``motion.npz`` in the README.
 

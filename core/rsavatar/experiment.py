@@ -18,8 +18,8 @@ from rsavatar.body.find import find_body
 from rsavatar.checkpoint import Owner, read_own
 from rsavatar.data.catalogue import open_subject
 from rsavatar.errors import CheckpointError
-from rsavatar.evaluate import Score, evaluate
-from rsavatar.events import Note, Report, silent
+from rsavatar.evaluate import Score, evaluate, write_preview
+from rsavatar.events import Note, Preview, Report, silent
 from rsavatar.methods.base import AbstractMethod, Case, build_actor, check_case, observations, settings
 from rsavatar.optimization import Saver
 from rsavatar.spec import JobSpec
@@ -97,7 +97,10 @@ def run(
     saver = Saver(_checkpoint_file(out, owner, report), owner)
     trained = fit(actor, observations(method, case), settings(case), saver, report, should_stop)
     scored = evaluate(actor, subject, spec.sh_degree, out, report)
-    metrics = out / "metrics.json"
+    artifacts = {"checkpoint": trained.checkpoint, "metrics": out / "metrics.json", "motion": out / "motion.npz"}
+    if preview := write_preview(scored.scores, subject, out):
+        artifacts["preview"] = preview[0]
+        report(Preview(spec.iterations, str(preview[0]), preview[1]))
     result = Result(
         spec=spec,
         means=scored.means,
@@ -107,9 +110,9 @@ def run(
         train_seconds=trained.seconds,
         evaluate_seconds=scored.seconds,
         provenance=_provenance(owner, trained.rejected),
-        artifacts={"checkpoint": trained.checkpoint, "metrics": metrics, "motion": out / "motion.npz"},
+        artifacts=artifacts,
     )
-    metrics.write_text(json.dumps(result.to_json(), indent=1) + "\n")
+    artifacts["metrics"].write_text(json.dumps(result.to_json(), indent=1) + "\n")
     return result
 
 

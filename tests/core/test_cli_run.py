@@ -30,6 +30,7 @@ def test_a_run_leaves_what_outside_programs_rely_on(
     assert "train 3/3" in said.err
     names = {f"{camera:02d}/{frame:06d}.png" for camera in TEST for frame in range(FRAMES)}
     assert {str(p.relative_to(out / "predictions")) for p in out.glob("predictions/*/*.png")} == names
+    assert (out / "preview.png").stat().st_size > 0
     with np.load(out / "motion.npz") as motion:
         shapes = {name: motion[name].shape for name in motion.files}
     n = FRAMES

@@ -123,6 +123,7 @@ function listen() {
   source.onopen = () => { link.textContent = "live"; link.classList.add("on"); };
   source.onerror = () => {
     link.classList.remove("on");
+    if (detail && terminal.has(detail.querySelector("[data-field=state]").textContent)) source.close();  // told all
     link.textContent = source.readyState === EventSource.CLOSED ? "ended" : "reconnecting";
   };
   for (const kind of ["state", "progress", "note", "preview", "checkpointed"]) source.addEventListener(kind, take);
