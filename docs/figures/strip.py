@@ -1,8 +1,8 @@
 """A held-out view as each method reconstructs it, beside the truth and the error: the picture of the README.
 
-    python docs/figures/strip.py SUBJECT_DIR CAMERA FRAME OUT.png NAME=RUN_DIR ...
+    python docs/figures/strip.py SUBJECT CAMERA FRAME OUT.png NAME=RUN_DIR ...
 
-RUN_DIR is what `rsavatar run --out` wrote. The first tile is what a rolling-shutter camera saw: the training camera
+SUBJECT is a folder, or studio. RUN_DIR is what `rsavatar run --out` wrote. The first tile is what a rolling-shutter camera saw: the training camera
 nearest to the held-out one.
 """
 
@@ -39,14 +39,14 @@ def tile(image: np.ndarray, box: tuple[int, int, int, int], caption: str) -> np.
 def main() -> None:
     """Read the arguments, write the strip."""
     root, camera, frame, out, *runs = sys.argv[1:]
-    subject, n = open_subject(Path(root).name, Path(root)), int(frame)
+    subject, n = open_subject(Path(root).name, None if root == "studio" else Path(root)), int(frame)
     truth, mask = subject.truth(camera, n)
     box = tight(mask)
     here = subject.cameras[camera].centre
     nearest = min(subject.training, key=lambda c: float(np.linalg.norm(subject.cameras[c].centre - here)))
     seen, seen_mask = subject.observe(nearest, n)
     seen_box = tight(seen_mask)
-    tiles = [tile(seen, seen_box, "rolling shutter (input)")]
+    tiles = [tile(seen, seen_box, "input")]
     for name, folder in (run.split("=", 1) for run in runs):
         image = cv2.imread(str(Path(folder) / "predictions" / camera / f"{n:06d}.png"))[..., ::-1]
         error = np.clip(np.abs(image.astype(float) - truth) * GAIN, 0, 255).astype(np.uint8)
