@@ -2,8 +2,8 @@
 
     python docs/figures/strip.py SUBJECT CAMERA FRAME OUT.png NAME=RUN_DIR ...
 
-SUBJECT is a folder, or studio. RUN_DIR is what `rsavatar run --out` wrote. The first tile is what a rolling-shutter camera saw: the training camera
-nearest to the held-out one.
+SUBJECT is a folder, or studio. RUN_DIR is what `rsavatar run --out` wrote. The first tile is what a rolling-shutter
+camera saw: the training camera nearest to the held-out one.
 """
 
 from __future__ import annotations
