@@ -121,7 +121,10 @@ def write_preview(scores: tuple[Score, ...], subject: Subject, out: Path) -> tup
     if not ranked:
         return None
     chosen = ranked[len(ranked) // 2]
-    image = cv2.imread(str(out / "predictions" / chosen.camera / f"{chosen.frame:06d}.png"))
+    written = out / "predictions" / chosen.camera / f"{chosen.frame:06d}.png"
+    image = cv2.imread(str(written))
+    if image is None:
+        raise DataError(expected(str(written), "the picture that was just written", "nothing readable"))
     truth, mask = subject.truth(chosen.camera, chosen.frame)
     x, y, width, height = cv2.boundingRect(mask)
     box = np.s_[max(y - 8, 0) : y + height + 8, max(x - 8, 0) : x + width + 8]
