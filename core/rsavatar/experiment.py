@@ -17,7 +17,7 @@ from rsavatar import __version__, catalog, kernels
 from rsavatar.body.find import find_body
 from rsavatar.checkpoint import Owner, read_own
 from rsavatar.data.catalogue import open_subject
-from rsavatar.errors import CheckpointError
+from rsavatar.errors import CheckpointError, SpecError, expected
 from rsavatar.evaluate import Score, evaluate, write_preview
 from rsavatar.events import Note, Preview, Report, silent
 from rsavatar.methods.base import AbstractMethod, Case, build_actor, check_case, observations, settings
@@ -75,10 +75,10 @@ def run(
 
     Resumes from the checkpoint there if it is of the same spec, data and code; the result is bit-identical to that of
     an undisturbed run. ``subject_dir`` None means a subject that the core makes itself (``studio``).
-    ``should_stop`` is asked once a step: when true, a checkpoint is written and ``Interrupted`` raised.
+    ``should_stop`` is asked between blocks of steps: when true, a checkpoint is written and ``Interrupted`` raised.
 
     Raises:
-        DataError, BodyError, CheckpointError, KernelError, DivergedError: as their names say.
+        DataError, BodyError, SpecError, CheckpointError, KernelError, DivergedError: as their names say.
         Interrupted: when ``should_stop`` asked for it.
     """
     _use_threads()
@@ -121,7 +121,10 @@ def _use_threads() -> None:
 
     Torch itself gets one: its sums depend on the number of threads, and its tensors here are small.
     """
-    kernels.use_threads(int(os.environ.get("RSAVATAR_THREADS", len(os.sched_getaffinity(0)))))
+    wanted = os.environ.get("RSAVATAR_THREADS") or str(len(os.sched_getaffinity(0)))
+    if not wanted.isdecimal() or int(wanted) < 1:
+        raise SpecError(expected("RSAVATAR_THREADS", "a whole number of at least 1", repr(wanted)))
+    kernels.use_threads(int(wanted))
     torch.set_num_threads(1)
 
 
