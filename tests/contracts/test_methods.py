@@ -57,12 +57,6 @@ class TestMethods:
         assert {(s.lo, s.hi, s.weight) for s in slots[0]} == {(0, 40, 0.2)}
         assert {(s.hi - s.lo, s.weight) for s in slots[1]} == {(8, 1.0)}
 
-    def test_blur_knows_no_triggers(self) -> None:
-        for name, known in (("mad-avatar", 0.0), ("rs-avatar", 2.0)):
-            case = small_subject.case(method=name, T=5)
-            seen = [o for o in observations(method_of(case), case) if o.frame == 0]
-            assert float(seen[1].schedule.offsets.mean() - seen[0].schedule.offsets.mean()) == pytest.approx(known)
-
     def test_T_defaults_to_K_for_what_counts_and_to_rows_for_ours(self) -> None:
         ours, blur = small_subject.case(method="rs-avatar"), small_subject.case(method="mad-avatar")
         assert len(method_of(ours).shutter(ours).slots(40, 11.0, 0.0)) == 1

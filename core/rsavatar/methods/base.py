@@ -70,10 +70,6 @@ class AbstractMethod(ABC):
     def motion(self, case: Case) -> AbstractMotion:
         """Pose as a function of time."""
 
-    def trigger(self, case: Case, camera: str) -> float:
-        """When the method believes that ``camera`` is triggered, in source frames from the frame's mid time."""
-        return case.subject.timing.trigger(camera)
-
     def initial_fit(self, case: Case) -> BodyFit:
         """Where the body's shape starts, and the poses that its pose blend shapes are taken at."""
         return case.subject.fit
@@ -121,8 +117,8 @@ def observations(method: AbstractMethod, case: Case) -> list[Observation]:
     subject, shutter = case.subject, method.shutter(case)
     found = []
     for name in subject.training:
-        camera = subject.cameras[name]
-        slots = shutter.slots(camera.height, subject.timing.readout_frames, method.trigger(case, name))
+        camera, trigger = subject.cameras[name], subject.timing.trigger(name)
+        slots = shutter.slots(camera.height, subject.timing.readout_frames, trigger)
         for frame in range(subject.frames):
             rgb, mask = subject.observe(name, frame)
             box = body_box(mask)

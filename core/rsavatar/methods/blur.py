@@ -9,19 +9,11 @@ from rsavatar.shutter.rolling import Blur
 
 
 class BlurAvatar(AbstractMethod):
-    """Differs from the paper's rolling-shutter model in the operator alone: the mean over the frame's own window.
-
-    That window is the same for all cameras, as in its authors' work: a model that knows no rolling-shutter schedule
-    knows no triggers of a rig either.
-    """
+    """Differs from the paper's rolling-shutter model in the operator alone."""
 
     def motion(self, case: Case) -> AbstractMotion:
         """The same as ``RollingShutterAvatar``'s."""
         return sub_frame_motion(case)
-
-    def trigger(self, case: Case, camera: str) -> float:
-        """0."""
-        return 0.0
 
     def shutter(self, case: Case) -> AbstractShutter:
         """The mean of T instants over the readout."""
