@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from alembic import command
 from alembic.config import Config
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import text
+from sqlalchemy import Connection, text
 from sqlalchemy.exc import DBAPIError
 
 from services.errors import SchemaError
@@ -49,12 +52,52 @@ def migrate(store: Store) -> None:
         SchemaError: if the database is ahead of this code.
     """
     _refuse_unknown(store)
-    configuration = config()
-    with store.engine.execution_options(immediate=True).begin() as connection:
-        if connection.dialect.name == "postgresql":
-            connection.execute(text("select pg_advisory_xact_lock(:key)"), {"key": MIGRATION_LOCK})
+    with _locked(store) as connection:
+        configuration = config()
         configuration.attributes["connection"] = connection
         command.upgrade(configuration, "head")
+
+
+def downgrade(store: Store, version: str) -> None:
+    """Bring the database back to an older ``version``; what only newer ones can say is lost.
+
+    Raises:
+        SchemaError: if the database is ahead of this code.
+    """
+    _refuse_unknown(store)
+    with _locked(store) as connection:
+        configuration = config()
+        configuration.attributes["connection"] = connection
+        command.downgrade(configuration, version)
+
+
+@contextmanager
+def _locked(store: Store) -> Iterator[Connection]:
+    """One transaction that no other migration shares. On SQLite without foreign keys while it lasts: to change a
+    table it builds a new one and drops the old, which would take the rows that refer to it along.
+    """
+    engine = store.engine.execution_options(immediate=True)
+    with engine.connect() as connection:
+        is_sqlite = connection.dialect.name == "sqlite"
+        if is_sqlite:
+            _foreign_keys(connection, "OFF")
+        try:
+            with connection.begin():
+                if not is_sqlite:
+                    connection.execute(text("select pg_advisory_xact_lock(:key)"), {"key": MIGRATION_LOCK})
+                yield connection
+                if is_sqlite and (broken := connection.execute(text("pragma foreign_key_check")).all()):
+                    raise SchemaError("database", "rows whose references hold", f"{len(broken)} that do not")
+        finally:
+            if is_sqlite:
+                _foreign_keys(connection, "ON")
+
+
+def _foreign_keys(connection: Connection, value: str) -> None:
+    driver: Any = (
+        connection.connection.driver_connection
+    )  # SQLAlchemy would open a transaction, in which it has no effect
+    driver.execute(f"PRAGMA foreign_keys={value}")
 
 
 def _refuse_unknown(store: Store) -> None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import JSON, BigInteger, Double, ForeignKey, Index, Integer, MetaData, String, Text
+from sqlalchemy import JSON, BigInteger, Double, ForeignKey, Index, Integer, MetaData, String, Text, UniqueConstraint
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
+LOCAL = "local"  # owner of what comes from this machine without a token
 NAMING = {
     "ix": "ix_%(table_name)s_%(column_0_N_name)s",
     "uq": "uq_%(table_name)s_%(column_0_N_name)s",
@@ -20,7 +21,7 @@ class Base(DeclarativeBase):
     """Base of the tables; constraints have names, so that migrations can find them."""
 
     metadata = MetaData(naming_convention=NAMING)
-    type_annotation_map = {float: Double, dict[str, Any]: JSON}  # noqa: RUF012  (SQLAlchemy's own protocol)
+    type_annotation_map = {float: Double, dict[str, Any]: JSON, list[Any]: JSON}  # noqa: RUF012  (SQLAlchemy's protocol)
 
 
 class JobRow(Base):
@@ -28,9 +29,16 @@ class JobRow(Base):
 
     __tablename__ = "jobs"
     __table_args__ = (
-        Index("ix_jobs_queue", "state", "priority", "id"),
+        Index("ix_jobs_queue", "state", "owner", "priority", "id"),
+        Index("ix_jobs_state_id", "state", "id"),
+        Index("ix_jobs_method_id", "method", "id"),
+        Index("ix_jobs_subject_id", "subject", "id"),
+        Index("ix_jobs_grid_id_id", "grid_id", "id"),
+        Index("ix_jobs_owner_id", "owner", "id"),
         Index("ix_jobs_spec_sha256", "spec_sha256"),
+        Index("ix_jobs_content_sha256", "content_sha256"),
         Index("ix_jobs_lease_until", "lease_until"),
+        UniqueConstraint("owner", "idempotency_key"),
     )
 
     id: Mapped[str] = mapped_column(String(36), primary_key=True)
@@ -39,14 +47,20 @@ class JobRow(Base):
     method: Mapped[str] = mapped_column(String(64))
     subject: Mapped[str] = mapped_column(String(128))
     priority: Mapped[int]
-    grid_id: Mapped[str | None] = mapped_column(String(36), index=True)
-    idempotency_key: Mapped[str | None] = mapped_column(String(255), unique=True)
+    grid_id: Mapped[str | None] = mapped_column(String(36))
+    owner: Mapped[str] = mapped_column(String(64), default=LOCAL, server_default=LOCAL)
+    notes: Mapped[str] = mapped_column(Text, default="", server_default="")
+    idempotency_key: Mapped[str | None] = mapped_column(String(255))
     request_sha256: Mapped[str] = mapped_column(String(64))
+    content_sha256: Mapped[str | None] = mapped_column(String(64))  # of spec, data and code
+    reused_from: Mapped[str | None] = mapped_column(String(36))
 
     state: Mapped[str] = mapped_column(String(16))
     attempt: Mapped[int] = mapped_column(default=0)
     failures: Mapped[int] = mapped_column(default=0)
     max_attempts: Mapped[int]
+    memory_limit_mb: Mapped[int | None]  # none: the settings'
+    stall_seconds: Mapped[float | None]  # none: the settings'
     lease_owner: Mapped[str | None] = mapped_column(String(255))
     lease_until: Mapped[float | None]
     not_before: Mapped[float] = mapped_column(default=0.0)
@@ -54,6 +68,7 @@ class JobRow(Base):
     pause_requested_at: Mapped[float | None]
     error_kind: Mapped[str | None] = mapped_column(String(32))
     error: Mapped[str | None] = mapped_column(Text)
+    first_traceback: Mapped[str | None] = mapped_column(Text)
 
     stage: Mapped[str | None] = mapped_column(String(32))
     step: Mapped[int] = mapped_column(default=0)
@@ -62,6 +77,7 @@ class JobRow(Base):
     psnr: Mapped[float | None]
     gaussians: Mapped[int | None]
     eta_seconds: Mapped[float | None]
+    rss_bytes: Mapped[int | None] = mapped_column(BigInteger)
 
     created_at: Mapped[float]
     started_at: Mapped[float | None]
@@ -149,6 +165,11 @@ class SubjectRow(Base):
     path: Mapped[str | None] = mapped_column(Text)
     kind: Mapped[str] = mapped_column(String(32))
     info: Mapped[dict[str, Any]]
+    owner: Mapped[str] = mapped_column(String(64), default=LOCAL, server_default=LOCAL)
+    state: Mapped[str] = mapped_column(String(16), default="ready", server_default="ready")  # checking, ready, refused
+    size: Mapped[int | None] = mapped_column(BigInteger)
+    stat_sha256: Mapped[str | None] = mapped_column(String(64))  # of names, sizes and times: is the next one fresh?
+    content_sha256: Mapped[str | None] = mapped_column(String(64))  # of names and bytes
     created_at: Mapped[float]
 
 
@@ -160,3 +181,137 @@ class SchedulerRow(Base):
     name: Mapped[str] = mapped_column(String(32), primary_key=True)
     owner: Mapped[str] = mapped_column(String(255))
     until: Mapped[float]
+
+
+class CheckpointRow(Base):
+    """A verified checkpoint of a job; its bytes lie under their hash, so that any worker can go on from it."""
+
+    __tablename__ = "checkpoints"
+
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True)
+    step: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    attempt: Mapped[int]
+    sha256: Mapped[str] = mapped_column(String(64), index=True)
+    size: Mapped[int] = mapped_column(BigInteger)
+    created_at: Mapped[float]
+
+
+class BlobRow(Base):
+    """Stored bytes. The row is written before the bytes and removed with them, so collection cannot race a writer."""
+
+    __tablename__ = "blobs"
+
+    sha256: Mapped[str] = mapped_column(String(64), primary_key=True)
+    size: Mapped[int] = mapped_column(BigInteger)
+    created_at: Mapped[float]
+    used_at: Mapped[float] = mapped_column(index=True)
+
+
+class StageRow(Base):
+    """Work that many jobs share and one process builds. ``attempt`` fences the builder as it does for jobs."""
+
+    __tablename__ = "stages"
+
+    key: Mapped[str] = mapped_column(String(64), primary_key=True)
+    kind: Mapped[str] = mapped_column(String(32))
+    state: Mapped[str] = mapped_column(String(16))
+    owner: Mapped[str | None] = mapped_column(String(255))
+    lease_until: Mapped[float | None]
+    attempt: Mapped[int] = mapped_column(default=0)
+    path: Mapped[str | None] = mapped_column(Text)
+    size: Mapped[int | None] = mapped_column(BigInteger)
+    created_at: Mapped[float]
+    used_at: Mapped[float]
+    error: Mapped[str | None] = mapped_column(Text)
+
+
+class OwnerRow(Base):
+    """Somebody who submits jobs, known from the first one. Limits that are none are the settings'."""
+
+    __tablename__ = "owners"
+
+    name: Mapped[str] = mapped_column(String(64), primary_key=True)
+    max_running: Mapped[int | None]
+    max_queued: Mapped[int | None]
+    share: Mapped[float] = mapped_column(default=1.0)
+    served_at: Mapped[float] = mapped_column(default=0.0)  # when a job of theirs was last claimed
+    created_at: Mapped[float]
+
+
+class GridRow(Base):
+    """Many jobs of one request: ``base`` varied along ``axes``, with ``includes`` and without ``excludes``."""
+
+    __tablename__ = "grids"
+    __table_args__ = (Index("ix_grids_owner_id", "owner", "id"),)
+
+    id: Mapped[str] = mapped_column(String(36), primary_key=True)
+    name: Mapped[str] = mapped_column(String(128))
+    base: Mapped[dict[str, Any]]
+    axes: Mapped[dict[str, Any]]
+    includes: Mapped[list[Any]]
+    excludes: Mapped[list[Any]]
+    owner: Mapped[str] = mapped_column(String(64), default=LOCAL)
+    notes: Mapped[str] = mapped_column(Text, default="")
+    created_at: Mapped[float]
+
+
+class TagRow(Base):
+    """A word on a job."""
+
+    __tablename__ = "job_tags"
+    __table_args__ = (Index("ix_job_tags_tag_job_id", "tag", "job_id"),)
+
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True)
+    tag: Mapped[str] = mapped_column(String(64), primary_key=True)
+
+
+class TokenRow(Base):
+    """A bearer token, of which only the hash is kept; ``prefix`` shows people which one it is."""
+
+    __tablename__ = "tokens"
+
+    id: Mapped[str] = mapped_column(String(36), primary_key=True)
+    name: Mapped[str] = mapped_column(String(128))
+    owner: Mapped[str] = mapped_column(String(64), index=True)
+    sha256: Mapped[str] = mapped_column(String(64), unique=True)
+    prefix: Mapped[str] = mapped_column(String(16))
+    scopes: Mapped[list[Any]]
+    created_at: Mapped[float]
+    expires_at: Mapped[float | None]
+    revoked_at: Mapped[float | None]
+    last_used_at: Mapped[float | None]
+
+
+class AuditRow(Base):
+    """Who did what, appended only; every row names the hash of the one before."""
+
+    __tablename__ = "audit"
+    __table_args__ = ({"sqlite_autoincrement": True},)
+
+    id: Mapped[int] = mapped_column(RowId, primary_key=True, autoincrement=True)
+    at: Mapped[float] = mapped_column(index=True)
+    actor: Mapped[str] = mapped_column(String(64), index=True)
+    token_id: Mapped[str | None] = mapped_column(String(36))
+    verb: Mapped[str] = mapped_column(String(64))
+    object: Mapped[str] = mapped_column(String(255), index=True)
+    outcome: Mapped[str] = mapped_column(String(32))
+    status: Mapped[int | None]
+    ip: Mapped[str | None] = mapped_column(String(64))
+    request_id: Mapped[str | None] = mapped_column(String(64))
+    detail: Mapped[dict[str, Any]]
+    previous_sha256: Mapped[str] = mapped_column(String(64))
+    sha256: Mapped[str] = mapped_column(String(64), unique=True)
+
+
+class BenchmarkRow(Base):
+    """What a benchmark measured, where and on which commit."""
+
+    __tablename__ = "benchmarks"
+    __table_args__ = (Index("ix_benchmarks_name_id", "name", "id"),)
+
+    id: Mapped[str] = mapped_column(String(36), primary_key=True)
+    name: Mapped[str] = mapped_column(String(64))
+    commit: Mapped[str] = mapped_column(String(64))
+    machine: Mapped[dict[str, Any]]
+    payload: Mapped[dict[str, Any]]
+    created_at: Mapped[float]

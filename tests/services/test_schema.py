@@ -9,10 +9,11 @@ from sqlalchemy import text
 
 from services.errors import SchemaError, SettingsError
 from services.settings import Settings
-from services.store import schema
+from services.store import events, jobs, leases, metrics, schema
+from services.store.records import Artifact, Batch, Point
 from services.store.session import Store
 from services.store.tables import Base
-from tests.services.conftest import POSTGRESQL
+from tests.services.conftest import POSTGRESQL, submit
 
 
 def test_migrations_end_in_the_declared_tables(store: Store) -> None:
@@ -40,6 +41,23 @@ def test_migrating_at_once_from_many_processes_is_safe(settings: Settings, empty
     for store in stores:
         schema.require_head(store)
         store.close()
+
+
+def test_rows_survive_the_way_up_and_down(store: Store) -> None:
+    job = submit(store, key="k")
+    claim = leases.claim(store, "w", 60.0)
+    assert claim is not None
+    leases.beat(store, claim, Batch(points=[Point("loss", 1, 0.5)], artifacts=[Artifact("a", "0" * 64, "m", 3)]), 60.0)
+    schema.downgrade(store, "0001")
+    assert schema.current(store) == "0001"
+    schema.migrate(store)
+    assert jobs.get(store, job.id).attempt == 1
+    assert metrics.curves(store, job.id) == {"loss": [(1, 0.5)]}
+    assert len(events.after(store, 0, job.id)) == 2
+    with store.read() as session:
+        assert session.scalar(text("select size from blobs where sha256 = :sha"), {"sha": "0" * 64}) == 3
+        if not POSTGRESQL:
+            assert session.scalar(text("pragma foreign_keys")) == 1
 
 
 @pytest.mark.skipif(bool(POSTGRESQL), reason="of SQLite")
