@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,11 +17,13 @@ from rsavatar.body.kinematics import pose
 from rsavatar.data.base import Array, Subject
 from rsavatar.errors import DataError, expected
 from rsavatar.events import Progress, Report
+from rsavatar.geometry.cameras import Camera
 from rsavatar.geometry.rotations import compose, exp_so3
 from rsavatar.imaging import Actor, expose, plan
 from rsavatar.metrics.base import protocol, score
 from rsavatar.metrics.pose import joint_error_mm, rotation_error_deg, sub_frame_joint_error_mm
 from rsavatar.metrics.timing import Stopwatch
+from rsavatar.shutter.base import Slot
 from rsavatar.shutter.rolling import Instant
 
 SUB_INSTANTS = 45  # S of motion.npz: instants over each readout, ends included
@@ -86,6 +88,13 @@ def render_view(
     """A sharp view of ``frame`` at the camera's mid-row instant, on black: [H, W, 3] uint8."""
     view, timing = subject.cameras[camera], subject.timing
     slots = Instant().slots(view.height, timing.readout_frames, timing.trigger(camera))
+    return render_slots(actor, view, frame, slots, skin_weights, sh_degree)
+
+
+def render_slots(
+    actor: Actor, view: Camera, frame: int, slots: Sequence[Slot], skin_weights: Tensor, sh_degree: int
+) -> npt.NDArray[np.uint8]:
+    """A whole picture of ``frame`` exposed as ``slots`` say, on black: [H, W, 3] uint8."""
     scene = actor.scene(frame, view, plan(slots, 0, view.height), skin_weights, sh_degree)
     rgb = expose(scene).rgb.permute(1, 2, 0).clamp(0, 1)
     pixels: npt.NDArray[np.uint8] = (rgb * 255 + 0.5).to(torch.uint8).numpy()
@@ -162,8 +171,8 @@ def _score_motion(actor: Actor, subject: Subject, path: Path) -> dict[str, float
     truth = subject.motion
     if truth is None:
         return {}
-    joints, rotations = _joints(actor, motion, "")
-    sub_joints, _ = _joints(actor, motion, "sub_")
+    joints, rotations = world_joints(actor, motion, "")
+    sub_joints, _ = world_joints(actor, motion, "sub_")
     true_pose = torch.from_numpy(truth.mid.poses.reshape(-1, 24, 3))
     true_rotations = _global_rotations(exp_so3(true_pose), torch.from_numpy(truth.mid.Rh), actor.parents.tolist())
     return {
@@ -173,7 +182,7 @@ def _score_motion(actor: Actor, subject: Subject, path: Path) -> dict[str, float
     }
 
 
-def _joints(actor: Actor, motion: Mapping[str, Array], prefix: str) -> tuple[Array, Array]:
+def world_joints(actor: Actor, motion: Mapping[str, Array], prefix: str) -> tuple[Array, Array]:
     """World joints [..., 24, 3] and global rotations [..., 24, 3, 3] of a motion's states."""
     poses, Rh, Th = (torch.from_numpy(motion[prefix + name]) for name in ("poses", "Rh", "Th"))
     rest = (actor.joints + actor.joint_directions @ actor.shapes).double()

@@ -22,6 +22,7 @@ from rsavatar.evaluate import Score, evaluate, write_preview
 from rsavatar.events import Note, Preview, Report, silent
 from rsavatar.methods.base import AbstractMethod, Case, build_actor, check_case, observations, settings
 from rsavatar.optimization import Saver
+from rsavatar.pictures import Shown, work_of, write_pictures
 from rsavatar.spec import JobSpec
 from rsavatar.train import fit
 
@@ -95,9 +96,12 @@ def run(
     actor = build_actor(method, case)
     owner = Owner(spec.sha256(), subject.fingerprint, body.sha256, __version__)
     saver = Saver(_checkpoint_file(out, owner, report), owner)
-    trained = fit(actor, observations(method, case), settings(case), saver, report, should_stop)
+    shown, seen = Shown(method, case, actor), observations(method, case)
+    work = work_of(shown, seen)
+    trained = fit(actor, seen, settings(case), saver, report, should_stop)
     scored = evaluate(actor, subject, spec.sh_degree, out, report)
     artifacts = {"checkpoint": trained.checkpoint, "metrics": out / "metrics.json", "motion": out / "motion.npz"}
+    artifacts |= write_pictures(shown, out)
     if preview := write_preview(scored.scores, subject, out):
         artifacts["preview"] = preview[0]
         report(Preview(spec.iterations, str(preview[0]), preview[1]))
@@ -109,7 +113,7 @@ def run(
         gaussians=actor.avatar.count,
         train_seconds=trained.seconds,
         evaluate_seconds=scored.seconds,
-        provenance=_provenance(owner, trained.rejected),
+        provenance=_provenance(owner, trained.rejected) | {"work": work},
         artifacts=artifacts,
     )
     artifacts["metrics"].write_text(json.dumps(result.to_json(), indent=1) + "\n")
