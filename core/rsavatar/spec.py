@@ -10,6 +10,8 @@ import hashlib
 import json
 import tomllib
 from collections.abc import Mapping
+from copy import deepcopy
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -111,6 +113,7 @@ class JobSpec(BaseModel):
         return hashlib.sha256(text.encode()).hexdigest()
 
 
+@cache
 def presets_dir() -> Path:
     """Folder of the preset files: inside an installed package, or ``core/experiments`` of a checkout."""
     here = Path(__file__).resolve().parent
@@ -123,11 +126,16 @@ def read_preset(name: str) -> dict[str, Any]:
     Raises:
         SpecError: if there is no such preset.
     """
-    names = sorted(p.stem for p in presets_dir().glob("*.toml"))
-    if name not in names:
-        raise SpecError(expected("preset", f"one of {', '.join(names)}", repr(name)))
-    with (presets_dir() / f"{name}.toml").open("rb") as file:
-        return tomllib.load(file)
+    presets = _presets(presets_dir())
+    if name not in presets:
+        raise SpecError(expected("preset", f"one of {', '.join(presets)}", repr(name)))
+    return deepcopy(presets[name])
+
+
+@cache
+def _presets(folder: Path) -> dict[str, dict[str, Any]]:
+    """Every preset file of a folder, read once: a grid resolves a thousand requests."""
+    return {path.stem: tomllib.loads(path.read_text("utf-8")) for path in sorted(folder.glob("*.toml"))}
 
 
 def resolve(request: Mapping[str, Any]) -> JobSpec:

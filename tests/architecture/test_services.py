@@ -9,7 +9,14 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 SERVICES = ROOT / "services"
-CORE_OF_API = ("rsavatar.spec", "rsavatar.catalog", "rsavatar.errors", "rsavatar.events", "rsavatar.report")
+CORE_OF_API = (
+    "rsavatar.spec",
+    "rsavatar.catalog",
+    "rsavatar.errors",
+    "rsavatar.events",
+    "rsavatar.report",
+    "rsavatar.grids",
+)
 CORE_OF_WORKER = ("rsavatar.experiment", "rsavatar.events", "rsavatar.spec", "rsavatar.errors")
 HEAVY = ("torch", "numpy", "scipy", "cv2", "matplotlib", "rsavatar.experiment", "rsavatar.render")
 
