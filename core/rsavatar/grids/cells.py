@@ -212,7 +212,7 @@ def _blame(sentence: str, chosen: Mapping[str, Value]) -> str:
     """The refusal of a cell, told of the axis that sets the refused word, or else of the base."""
     word = sentence.partition(":")[0].partition(".")[0]
     cell = ", ".join(f"{name}={value.label}" for name, value in chosen.items()) or "base"
-    for name, value in reversed(chosen.items()):
+    for name, value in reversed(list(chosen.items())):
         if word in value.words:
             return expected(
                 f"axes.{name}", "values that every cell can have", f"{value.label!r} in {cell} ({sentence})"
