@@ -12,7 +12,15 @@ branch_labels = None
 depends_on = None
 
 NEW_TABLES = ("audit", "benchmarks", "blobs", "checkpoints", "grids", "job_tags", "owners", "stages", "tokens")
-NEW_OF_JOBS = ("rss_bytes", "first_traceback", "stall_seconds", "memory_limit_mb", "reused_from", "content_sha256")
+NEW_OF_JOBS = (
+    "rss_bytes",
+    "first_traceback",
+    "stall_seconds",
+    "memory_limit_mb",
+    "reused_from",
+    "forced",
+    "content_sha256",
+)
 NEW_OF_SUBJECTS = ("content_sha256", "stat_sha256", "size", "state", "owner")
 KNOWN_BLOBS = """
     insert into blobs (sha256, size, created_at, used_at)
@@ -160,6 +168,7 @@ def upgrade() -> None:
         batch_op.add_column(sa.Column("owner", sa.String(length=64), server_default="local", nullable=False))
         batch_op.add_column(sa.Column("notes", sa.Text(), server_default="", nullable=False))
         batch_op.add_column(sa.Column("content_sha256", sa.String(length=64), nullable=True))
+        batch_op.add_column(sa.Column("forced", sa.Boolean(), server_default=sa.false(), nullable=False))
         batch_op.add_column(sa.Column("reused_from", sa.String(length=36), nullable=True))
         batch_op.add_column(sa.Column("memory_limit_mb", sa.Integer(), nullable=True))
         batch_op.add_column(sa.Column("stall_seconds", sa.Double(), nullable=True))
