@@ -7,7 +7,7 @@ import os
 import platform
 import subprocess
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,10 @@ import torch
 
 from rsavatar import __version__, catalog, kernels
 from rsavatar.body.find import find_body
+from rsavatar.calibration import found_schedule, schedule_errors
 from rsavatar.checkpoint import Owner, read_own
 from rsavatar.data.catalogue import open_subject
+from rsavatar.data.disturb import disturb
 from rsavatar.errors import CheckpointError, SpecError, expected
 from rsavatar.evaluate import Score, evaluate, write_preview
 from rsavatar.events import Note, Preview, Report, silent
@@ -24,7 +26,7 @@ from rsavatar.methods.base import AbstractMethod, Case, build_actor, check_case,
 from rsavatar.optimization import Saver
 from rsavatar.pictures import Shown, work_of, write_pictures
 from rsavatar.spec import JobSpec
-from rsavatar.train import fit
+from rsavatar.train import Trained, fit
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,8 @@ class Result:
     """What a job found. ``to_json`` is the content of ``OUT/metrics.json``.
 
     ``means`` is over frames, then cameras (paper, section 4.1); it also holds ``joint_mm``, ``joint_deg`` and
-    ``sub_frame_joint_mm`` where the subject has a true motion.
+    ``sub_frame_joint_mm`` where the subject has a true motion, and ``readout_error_*`` and ``trigger_error_*`` where
+    the schedule was disturbed or calibrated.
     """
 
     spec: JobSpec
@@ -44,6 +47,7 @@ class Result:
     evaluate_seconds: float
     provenance: Mapping[str, Any]  # code version, commit, data and spec sha256, machine, threads
     artifacts: Mapping[str, Path]  # name -> file: checkpoint, metrics, motion, previews
+    schedule: Mapping[str, Any] = field(default_factory=dict)  # readouts and triggers found; empty if not calibrated
 
     def to_json(self) -> dict[str, Any]:
         """Plain JSON values."""
@@ -62,6 +66,7 @@ class Result:
             "train_seconds": self.train_seconds,
             "evaluate_seconds": self.evaluate_seconds,
             "provenance": dict(self.provenance),
+            "schedule": dict(self.schedule),
         }
 
 
@@ -90,7 +95,7 @@ def run(
     report(Note(which))
     if not kernels.available():
         report(Note("No native kernels: rendering with the torch twin, several hundred times slower."))
-    case = Case(spec, subject, body)
+    case = Case(spec, disturb(subject, spec.disturb, spec.seed), body)
     check_case(case)
     method: AbstractMethod = catalog.load(catalog.METHODS, spec.method)()
     actor = build_actor(method, case)
@@ -105,16 +110,19 @@ def run(
     if preview := write_preview(scored.scores, subject, out):
         artifacts["preview"] = preview[0]
         report(Preview(spec.iterations, str(preview[0]), preview[1]))
+    found = found_schedule(case.subject.timing, subject.training, actor.clock)
+    uncertain = bool(spec.calibrate or spec.disturb.readout or spec.disturb.trigger)
     result = Result(
         spec=spec,
-        means=scored.means,
+        means={**scored.means, **(schedule_errors(found, subject) if uncertain else {})},
         scores=scored.scores,
         protocol=scored.protocol,
         gaussians=actor.avatar.count,
         train_seconds=trained.seconds,
         evaluate_seconds=scored.seconds,
-        provenance=_provenance(owner, trained.rejected) | {"work": work},
+        provenance=_provenance(owner, trained) | {"work": work},
         artifacts=artifacts,
+        schedule=found.to_json(subject.timing) if uncertain else {},
     )
     artifacts["metrics"].write_text(json.dumps(result.to_json(), indent=1) + "\n")
     return result
@@ -146,7 +154,7 @@ def _checkpoint_file(out: Path, owner: Owner, report: Report) -> Path:
     return path
 
 
-def _provenance(owner: Owner, rejected: int) -> dict[str, Any]:
+def _provenance(owner: Owner, trained: Trained) -> dict[str, Any]:
     """What produced the numbers."""
     return {
         "version": __version__,
@@ -158,7 +166,8 @@ def _provenance(owner: Owner, rejected: int) -> dict[str, Any]:
         "kernels": kernels.targets()[0] if kernels.available() else "torch twin",
         "threads": kernels.threads(),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, {platform.system()}",
-        "rejected_steps": rejected,
+        "rejected_steps": trained.rejected,
+        "doubted_images": list(trained.doubted),
     }
 
 

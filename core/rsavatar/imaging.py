@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from math import cos, pi
 
@@ -19,6 +19,7 @@ from rsavatar.motion.base import AbstractMotion
 from rsavatar.render import native, reference
 from rsavatar.render.base import Rendering, Scene, TimedRows
 from rsavatar.shutter.base import Slot
+from rsavatar.shutter.clock import ReadoutClock
 
 NODES = 5  # Chebyshev nodes of a scanned slot: four leave 6 dB at 200 px of motion, and cost as much
 
@@ -30,6 +31,8 @@ class Schedule:
     offsets: Tensor  # [T * D] float64, source frames from the frame's mid time
     rows: tuple[TimedRows, ...]  # T of them
     coefficients: int  # D
+    camera: int = 0  # whose clock it is on, an index; only a clock that is being calibrated asks
+    reading: Tensor | None = None  # [T * D] the part of ``offsets`` that is proportional to the readout
 
 
 @cache
@@ -83,8 +86,12 @@ class Actor(torch.nn.Module):
         pose_offsets: Tensor | None = None,
         pose_residual: PoseResidual | None = None,
         skin_offset: SkinOffset | None = None,
+        clock: ReadoutClock | None = None,
     ) -> None:
-        """``pose_offsets`` [N, 3, V] are the pose blend shapes of each frame; None where the body has none."""
+        """``pose_offsets`` [N, 3, V] are the pose blend shapes of each frame; None where the body has none.
+
+        ``clock`` corrects the schedules' instants; None where they are known.
+        """
         super().__init__()
         body = avatar.surface.body
         self.avatar = avatar
@@ -96,6 +103,7 @@ class Actor(torch.nn.Module):
         self.register_buffer("joint_directions", torch.from_numpy(body.joint_directions).float(), persistent=False)
         self.pose_residual = pose_residual
         self.skin_offset = skin_offset
+        self.clock = clock
 
     def residuals(self, rotations: Tensor) -> Tensor | None:
         """Residual axis-angle [D, 24, 3] of poses [D, 24, 3] (paper, eq. disp, composed on SO(3)); None without it."""
@@ -114,6 +122,12 @@ class Actor(torch.nn.Module):
         if self.skin_offset is None:
             return self.avatar.prior
         return refine(self.avatar.prior, self.skin_offset(self.avatar.means.detach()))
+
+    def timed(self, schedule: Schedule) -> Schedule:
+        """``schedule`` at the instants that the clock has found so far (paper, eq. rowtime with rho_c and delta_c)."""
+        if self.clock is None or schedule.reading is None:
+            return schedule
+        return replace(schedule, offsets=self.clock(schedule.camera, schedule.offsets, schedule.reading))
 
     def scene(self, frame: int, camera: Camera, schedule: Schedule, skin_weights: Tensor, sh_degree: int) -> Scene:
         """Everything that one image of ``frame`` needs."""

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from rsavatar import checkpoint
 from rsavatar.avatar.density import DensityRules, Edit, ScreenGradients
+from rsavatar.doubt import Doubt
 from rsavatar.errors import DivergedError, expected
 from rsavatar.events import Checkpointed
 from rsavatar.imaging import Actor
@@ -34,6 +35,7 @@ class Rates:
     motion: float = 1e-3  # control points and shape; falls to 1/100 of itself, log-linearly
     pose_residual: float = 5e-5
     skin_offset: float = 5e-4  # one step a block, on the sum of its gradients
+    clock: float = 2e-3  # readouts as a part of themselves, triggers in periods; falls to 1/100 as the motion's
     largest: float = math.inf  # metres
 
 
@@ -57,10 +59,16 @@ class Settings:
     density: DensityRules | None
     rates: Rates = field(default_factory=Rates)
     sh_from: int = 1000  # step at which the colours' linear harmonics start
+    doubt: bool = False
+    doubt_from: float = 0.2  # part of the run after which images that contradict all others are left out
 
     def degree(self, step: int) -> int:
         """Degree of the colours' harmonics at ``step``."""
         return self.sh_degree if step >= self.sh_from else 0
+
+    def doubts(self, step: int) -> bool:
+        """Whether images are judged after ``step``."""
+        return self.doubt and self.doubt_from * self.iterations <= step < self.iterations
 
     def closes_block(self, step: int) -> bool:
         """Whether a block of steps ends at ``step`` (counted from 1)."""
@@ -90,7 +98,7 @@ class SkinBlock:
 class State:
     """Everything that changes from step to step, besides the actor's own parameters."""
 
-    def __init__(self, actor: Actor, settings: Settings) -> None:
+    def __init__(self, actor: Actor, settings: Settings, images: int = 0) -> None:
         rates, a = settings.rates, actor.avatar
         motion = [*actor.motion.parameters(), actor.shapes]
         groups: list[tuple[str, list[torch.nn.Parameter], float]] = [
@@ -106,12 +114,14 @@ class State:
                 list(actor.pose_residual.parameters()) if actor.pose_residual else [],
                 rates.pose_residual,
             ),
+            ("clock", list(actor.clock.parameters()) if actor.clock else [], rates.clock),
         ]
         adam = [{"name": name, "params": params, "lr": lr, "initial": lr} for name, params, lr in groups if params]
         self.optimizer = torch.optim.Adam(adam, eps=1e-15, fused=True)
         skin = list(actor.skin_offset.parameters()) if actor.skin_offset else [torch.nn.Parameter(torch.zeros(0))]
         self.skin_optimizer = torch.optim.Adam(skin, lr=rates.skin_offset, fused=True)
         self.gradients = ScreenGradients(actor.avatar.count)
+        self.doubt = Doubt(images)
         self.largest = rates.largest
         self.step = 0
         self.rejected = 0
@@ -167,10 +177,10 @@ class State:
         return rejected
 
     def set_rates(self, settings: Settings) -> None:
-        """Means and motion fall to a hundredth of their first rate, log-linearly over the run."""
+        """Means, motion and clock fall to a hundredth of their first rate, log-linearly over the run."""
         decay = 0.01 ** (self.step / settings.iterations)
         for group in self.optimizer.param_groups:
-            if group["name"] in ("means", "motion"):
+            if group["name"] in ("means", "motion", "clock"):
                 group["lr"] = group["initial"] * decay
 
     def edit(self, actor: Actor, edit: Edit) -> None:
@@ -199,6 +209,7 @@ def _grad(tensor: Tensor) -> Tensor:
 def _finite(loss: Tensor, screen: Tensor, actor: Actor) -> bool:
     """Whether the loss is finite, and the gradients of what is drawn: all others come from these."""
     watched = [screen, *actor.avatar.parameters(), actor.shapes, *actor.motion.parameters()]
+    watched += [] if actor.clock is None else list(actor.clock.parameters())
     return math.isfinite(float(loss)) and all(math.isfinite(float(_grad(t).sum())) for t in watched)
 
 
@@ -221,20 +232,21 @@ class Saver:
             for i, moments in optimizer.state_dict()["state"].items():
                 tensors |= {f"{prefix}.{i}.{key}": value for key, value in moments.items()}
         tensors |= {"gradients.total": state.gradients.total, "gradients.seen": state.gradients.seen}
+        tensors |= {"doubt.losses": state.doubt.losses, "doubt.doubted": state.doubt.doubted}
         tensors["progress"] = torch.tensor([state.rejected, state.seconds, state.best], dtype=torch.float64)
         return Checkpointed(state.step, str(self.path), checkpoint.write(self.path, tensors, self.owner, state.step))
 
-    def restore(self, actor: Actor, settings: Settings) -> State:
-        """The state to go on from: the checkpoint's, or a new one where there is none.
+    def restore(self, actor: Actor, settings: Settings, images: int) -> State:
+        """The state to go on from, over so many training images: the checkpoint's, or a new one where there is none.
 
         Raises:
             CheckpointError: if there is one that is damaged or belongs to another job.
         """
         if not self.path.exists():
-            return State(actor, settings)
+            return State(actor, settings, images)
         tensors, step = checkpoint.read_own(self.path, self.owner)
         load_actor(actor, tensors)
-        state = State(actor, settings)
+        state = State(actor, settings, images)
         for prefix, optimizer in (("adam", state.optimizer), ("skin_adam", state.skin_optimizer)):
             saved = optimizer.state_dict()
             for name, value in tensors.items():
@@ -243,6 +255,7 @@ class Saver:
                     saved["state"].setdefault(int(i), {})[key] = value
             optimizer.load_state_dict(saved)
         state.gradients.total, state.gradients.seen = tensors["gradients.total"], tensors["gradients.seen"]
+        state.doubt.losses, state.doubt.doubted = tensors["doubt.losses"], tensors["doubt.doubted"]
         rejected, state.seconds, state.best = tensors["progress"].tolist()
         state.rejected = int(rejected)
         state.step = step

@@ -113,6 +113,8 @@ def _references(subject: Subject) -> Iterable[tuple[str, bytes]]:
     for camera in subject.training:
         for frame in range(subject.frames):
             place = f"{camera}/{frame:06d}"
+            if (camera, frame) in subject.missing:
+                continue
             yield f"{place}/input.png", _png(subject.observe(camera, frame)[0])
             try:
                 yield f"{place}/truth.png", _png(subject.truth(camera, frame)[0])

@@ -21,10 +21,12 @@ from rsavatar.catalog import METHODS
 from rsavatar.errors import SpecError, expected
 
 Preset = Literal["smoke", "draft", "paper"]
+Unknown = Literal["readout", "trigger"]  # of a camera's schedule: rho_c and delta_c
 Bands = Annotated[int, Field(ge=1, le=8192)] | Annotated[str, Field(pattern=r"^([2-9]|[1-9][0-9])?K$|^scanline$")]
 BANDS_WANTED = "an integer from 1 to 8192, K, 2K to 99K, or scanline"
 
 SELECTING_METHODS = frozenset({"rs-avatar", "oracle"})  # methods whose shutter selects rows
+CALIBRATING_METHODS = frozenset({"rs-avatar", "mad-avatar"})  # methods that know of instants within a frame
 FLAGS_OF_METHOD: dict[str, frozenset[str]] = {  # the components that a method has, so can lose
     "rs-avatar": frozenset({"no_rs", "no_spline", "no_pose_deformation", "no_lbs_refinement", "no_reg"}),
     "mad-avatar": frozenset({"no_spline", "no_pose_deformation", "no_lbs_refinement", "no_reg"}),
@@ -47,6 +49,22 @@ class Ablation(BaseModel):
     def flags(self) -> tuple[str, ...]:
         """Names of the flags that are set, in declaration order."""
         return tuple(name for name in type(self).model_fields if getattr(self, name))
+
+
+class Disturbance(BaseModel):
+    """What is made worse than the subject gives it, to measure what that costs. All that is random follows the seed."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    readout: float = Field(0.0, gt=-1, le=10, description="the readout is taken to be this much longer, as a fraction")
+    trigger: float = Field(0.0, ge=-1, le=1, description="triggers taken late and early by turns, in frame periods")
+    fit: float = Field(1.0, ge=0, le=10, description="factor on the initial fit's error; needs a true motion")
+    missing: float = Field(0.0, ge=0, lt=1, description="share of the training images that are not there")
+    masks: float = Field(0.0, ge=0, lt=1, description="share of the training images whose mask is wrong")
+
+    def any(self) -> bool:
+        """Whether anything is disturbed."""
+        return self != Disturbance()
 
 
 class JobSpec(BaseModel):
@@ -85,6 +103,14 @@ class JobSpec(BaseModel):
     densify: bool = Field(True, description="adaptive density control: clone, split, prune")
     checkpoint_every: int = Field(1000, ge=1, description="steps between checkpoints")
 
+    calibrate: tuple[Unknown, ...] = Field((), description="what of the schedule is learned: readout, trigger")
+    exposure_frames: float | None = Field(
+        None, ge=0, le=1000, description="exposure of a row in source frames; none = the subject's own; 0 = ignored"
+    )
+    exposure_samples: int = Field(4, ge=1, le=64, description="scans that an exposure is the mean of")
+    doubt: bool = Field(True, description="leave out training images that contradict all others")
+    disturb: Disturbance = Field(Disturbance(), description="what is made worse than given, as an experiment")
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if self.method not in METHODS:
@@ -97,7 +123,20 @@ class JobSpec(BaseModel):
             raise ValueError(expected("ablation.no_reg", "motion frame-spline, which has a penalty", repr(self.motion)))
         if self.T == "scanline" and self.method == "mad-avatar":
             raise ValueError(expected("T", "a finite number of renders for mad-avatar to average", "'scanline'"))
+        self._check_schedule()
         return self
+
+    def _check_schedule(self) -> None:
+        """What is asked of the shutter must be something that the method looks at."""
+        blind = self.method not in CALIBRATING_METHODS or self.ablation.no_spline or self.ablation.no_rs
+        if self.calibrate and blind:
+            wanted = f"none, or {' or '.join(sorted(CALIBRATING_METHODS))} with a spline and its shutter model"
+            raise ValueError(expected("calibrate", wanted, ", ".join(self.calibrate)))
+        if self.exposure_frames and (self.method not in SELECTING_METHODS or self.T != "scanline"):
+            wanted = f"none, or T = scanline of {' or '.join(sorted(SELECTING_METHODS))}"
+            raise ValueError(expected("exposure_frames", wanted, self.exposure_frames))
+        if self.method == "oracle" and self.disturb.any():
+            raise ValueError(expected("disturb", "nothing for oracle, which is given the truth", self.disturb))
 
     def bands(self, source_frames: int) -> int | Literal["scanline"]:
         """``T`` as a number (or ``"scanline"``) once ``K = source_frames`` is known."""

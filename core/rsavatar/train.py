@@ -34,6 +34,7 @@ class Observation:
     rgb: Tensor  # [3, h, w] uint8
     mask: Tensor  # [h, w] uint8 coverage
     full_size: tuple[int, int]  # height and width of the uncut image
+    label: str = ""  # camera and frame, for people
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class Trained:
     seconds: float
     rejected: int
     checkpoint: Path
+    doubted: tuple[str, ...] = ()  # labels of the images that were left out
 
 
 def fit(
@@ -57,24 +59,28 @@ def fit(
 
     One observation a step, each once an epoch in a new order. Every random choice is a function of the seed and the
     step, so a run resumed from a checkpoint ends bit-identical to one that was never disturbed. Skinning weights are
-    refreshed, Gaussians come and go, and checkpoints are written between blocks of steps.
+    refreshed, Gaussians come and go, images that contradict all others are left out, and checkpoints are written
+    between blocks of steps.
 
     Raises:
         DivergedError: if many steps in a row gave no finite loss and gradient, the loss is far above its best, or no
             Gaussians are left. The last good checkpoint is kept.
         Interrupted: if ``should_stop`` asked for it; the checkpoint is on disk.
     """
-    state = saver.restore(actor, settings)
+    state = saver.restore(actor, settings, len(observations))
     gc.freeze()  # what is alive now lives to the end: the collector need not walk it again and again
     begun = time.perf_counter() - state.seconds
-    skin = SkinBlock(actor)
+    skin, trusted = SkinBlock(actor), state.doubt.trusted
     while state.step < settings.iterations:
-        seen = observations[pick(settings.seed, state.step, len(observations))]
+        index = trusted[pick(settings.seed, state.step, len(trusted))]
+        seen = observations[index]
         state.set_rates(settings)
 
-        scene = actor.scene(seen.frame, seen.camera, seen.schedule, skin.weights, settings.degree(state.step))
+        schedule = actor.timed(seen.schedule)
+        scene = actor.scene(seen.frame, seen.camera, schedule, skin.weights, settings.degree(state.step))
         image = expose(scene)
         loss = l1(image, seen.rgb, seen.mask, 0.0, settings.mask_weight)
+        state.doubt.note(index, float(loss.detach()))
         if settings.lambda_reg:
             loss = loss + settings.lambda_reg * actor.motion.penalty(settings.continuity)
         torch.autograd.backward(loss)
@@ -88,6 +94,9 @@ def fit(
             skin.close(state.skin_optimizer)
             if rejected := state.close_block(actor):
                 report(Note(f"step {state.step}: {rejected} steps of this block rejected, no finite loss and gradient"))
+            if settings.doubts(state.step) and (left := state.doubt.judge(_cameras(observations))):
+                report(Note(f"step {state.step}: left out as contradicting all others: {_labels(observations, left)}"))
+                trusted = state.doubt.trusted
             if settings.density and settings.density.due(state.step):
                 report(Note(_control_density(actor, state, settings, settings.density)))
             stop = not last and should_stop()
@@ -96,7 +105,8 @@ def fit(
             if stop:
                 raise Interrupted(f"stopped at step {state.step} of {settings.iterations}; run again to go on")
             skin = SkinBlock(actor)
-    return Trained(state.seconds, state.rejected, saver.path)
+    doubted = tuple(seen.label for seen, bad in zip(observations, state.doubt.doubted.tolist(), strict=True) if bad)
+    return Trained(state.seconds, state.rejected, saver.path, doubted)
 
 
 def pick(seed: int, step: int, count: int) -> int:
@@ -104,6 +114,14 @@ def pick(seed: int, step: int, count: int) -> int:
     epoch, place = divmod(step, count)
     order = torch.randperm(count, generator=torch.Generator().manual_seed(seed * 1_000_003 + epoch))
     return int(order[place])
+
+
+def _cameras(observations: Sequence[Observation]) -> Tensor:
+    return torch.tensor([seen.schedule.camera for seen in observations])
+
+
+def _labels(observations: Sequence[Observation], chosen: Sequence[int]) -> str:
+    return ", ".join(observations[i].label for i in chosen)
 
 
 def _control_density(actor: Actor, state: State, settings: Settings, rules: DensityRules) -> str:

@@ -101,7 +101,7 @@ def test_a_checkpoint_of_another_job_is_refused(tmp_path: Path) -> None:
     case = small_subject.case(iterations=150)
     saver = Saver(tmp_path / "checkpoint.safetensors", replace(OWNER, data="other"))
     with pytest.raises(CheckpointError, match="data: expected other, got data"):
-        saver.restore(build_actor(RollingShutterAvatar(), case), settings(case))
+        saver.restore(build_actor(RollingShutterAvatar(), case), settings(case), 6)
 
 
 def test_a_truncated_checkpoint_is_refused(tmp_path: Path) -> None:

@@ -51,6 +51,8 @@ class Timing:
     readout_frames: float  # gamma * K
     period_frames: float  # K
     trigger_frames: Mapping[str, float] = field(default_factory=dict)  # delta_c by camera name; absent = 0
+    exposure_frames: float = 0.0  # of every row, centred on the row's time
+    fps: float | None = None  # source frames a second, where they are known
 
     def trigger(self, camera: str) -> float:
         """delta_c in source frames."""
@@ -90,6 +92,7 @@ class Subject:
     fingerprint: str
     body: Path | None = None  # body model that lies with the data
     motion: TrueMotion | None = None
+    missing: frozenset[tuple[str, int]] = frozenset()  # training images (camera, frame) that were never taken
 
     @property
     def frames(self) -> int:

@@ -1,6 +1,7 @@
 """Rolling-shutter subjects: ``meta.json``, ``rs/`` and, for synthetic ones, ``truth/``.
 
-meta.json            mid, K, gamma, train, test; optional excluded, delta, pixel_centre (default 0)
+meta.json            mid, K, gamma, train, test; optional excluded, delta, pixel_centre (default 0), fps (of the
+                     source), exposure (source frames), missing ([camera, frame] pairs of rs/images that do not exist)
 rs/annots.npy        calibration, T in millimetres
 rs/images/<cc>/<nnnnnn>.png  rs/mask/...     what the training cameras saw; mask != 0 is the person
 rs/gt/<cc>/...       rs/gt_mask/...          sharp frames at the mid-row time of all listed cameras
@@ -36,6 +37,9 @@ class Meta:
     gamma: float  # readout / period
     delta: tuple[float, ...]  # by camera index; empty = all 0
     pixel_centre: float  # where the first pixel's centre lies
+    exposure: float  # source frames
+    fps: float | None  # source frames a second
+    missing: frozenset[tuple[str, int]]  # training images, by camera name and frame, that there are none of
 
 
 def load(root: Path) -> Subject:
@@ -53,15 +57,15 @@ def load(root: Path) -> Subject:
     listed = meta.train + meta.test if sharp else meta.train
     _check_cameras(root, listed, len(calibrations))
     frames = range(len(meta.mid))
-    observed = _frames(root / "rs" / "images", root / "rs" / "mask", meta.train, frames)
+    observed = _frames(root / "rs" / "images", root / "rs" / "mask", meta.train, frames, meta.missing)
     truths = _frames(root / "rs" / "gt", root / "rs" / "gt_mask", listed, frames) if sharp else {}
     folder = fit_folder(root / "rs")
+    picture = {camera: frame.image for (camera, _), frame in {**truths, **observed}.items()}  # any one of a camera
     return Subject(
         name=root.resolve().name,
         root=root,
         cameras={
-            name_of(c): calibrations[c].camera(size_of({**truths, **observed}[name_of(c), 0].image), meta.pixel_centre)
-            for c in sorted(listed)
+            name_of(c): calibrations[c].camera(size_of(picture[name_of(c)]), meta.pixel_centre) for c in sorted(listed)
         },
         training=tuple(map(name_of, meta.train)),
         held_out=tuple(map(name_of, meta.test)) if sharp else (),
@@ -72,6 +76,7 @@ def load(root: Path) -> Subject:
         fingerprint=_fingerprint(root, folder, [*observed.values(), *truths.values()]),
         body=find_body_file(root),
         motion=read_motion(root / "truth" / "motion.npz"),
+        missing=meta.missing,
     )
 
 
@@ -137,6 +142,9 @@ def _parse_meta(path: Path, values: dict[str, Any]) -> Meta:
         gamma=float(values.get("gamma", 1.0)),
         delta=tuple(map(float, values.get("delta", []))),
         pixel_centre=float(values.get("pixel_centre", 0.0)),
+        exposure=float(values.get("exposure", 0.0)),
+        fps=None if values.get("fps") is None else float(values["fps"]),
+        missing=frozenset((name_of(int(c)), int(n)) for c, n in values.get("missing", [])),
     )
 
 
@@ -147,6 +155,11 @@ def _check_meta(path: Path, meta: Meta, frames: int) -> None:
         raise DataError(expected(f"{path} train", "at least one camera that is not excluded", "none"))
     if not (meta.period > 0 and meta.gamma >= 0 and np.isfinite([meta.period, meta.gamma]).all()):
         raise DataError(expected(f"{path} K and gamma", "K > 0, gamma >= 0", (meta.period, meta.gamma)))
+    if not (0 <= meta.exposure < np.inf and (meta.fps is None or 0 < meta.fps < np.inf)):
+        raise DataError(expected(f"{path} exposure and fps", "exposure >= 0, fps > 0", (meta.exposure, meta.fps)))
+    unknown = sorted(f for f in meta.missing if f[0] not in map(name_of, meta.train) or not 0 <= f[1] < frames)
+    if unknown:
+        raise DataError(expected(f"{path} missing", "pairs of a training camera and a frame", unknown))
     if meta.pixel_centre not in (0.0, 0.5):
         raise DataError(expected(f"{path} pixel_centre", "0 or 0.5", meta.pixel_centre))
     if meta.delta and len(meta.delta) <= max(meta.train + meta.test):
@@ -161,12 +174,19 @@ def _check_cameras(root: Path, listed: Iterable[int], calibrated: int) -> None:
         raise DataError(expected(str(root / "rs" / "annots.npy"), wanted, f"{calibrated} cameras, none for {unknown}"))
 
 
-def _frames(images: Path, masks: Path, cameras: Iterable[int], frames: range) -> dict[tuple[str, int], Frame]:
-    return {
-        (name_of(camera), index): frame
-        for camera in cameras
-        for index, frame in zip(frames, locate(images / name_of(camera), masks / name_of(camera), frames), strict=True)
-    }
+def _frames(
+    images: Path,
+    masks: Path,
+    cameras: Iterable[int],
+    frames: range,
+    missing: frozenset[tuple[str, int]] = frozenset(),
+) -> dict[tuple[str, int], Frame]:
+    found = {}
+    for name in map(name_of, cameras):
+        there = [index for index in frames if (name, index) not in missing]
+        located = locate(images / name, masks / name, there)
+        found.update({(name, index): frame for index, frame in zip(there, located, strict=True)})
+    return found
 
 
 def _reader(what: str, frames: Frames, calibrations: list[Calibration], pixel_centre: float) -> ReadImage:
@@ -181,7 +201,7 @@ def _reader(what: str, frames: Frames, calibrations: list[Calibration], pixel_ce
 
 def _timing(meta: Meta, listed: Iterable[int]) -> Timing:
     triggers = {name_of(camera): meta.delta[camera] for camera in listed} if meta.delta else {}
-    return Timing(meta.mid, meta.gamma * meta.period, meta.period, triggers)
+    return Timing(meta.mid, meta.gamma * meta.period, meta.period, triggers, meta.exposure, meta.fps)
 
 
 def _fingerprint(root: Path, folder: Path, frames: list[Frame]) -> str:

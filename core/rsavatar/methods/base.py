@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,13 +15,14 @@ from rsavatar.avatar.surface import Surface
 from rsavatar.body.base import BodyModel
 from rsavatar.data.base import BodyFit, Bytes, Subject
 from rsavatar.errors import DataError, SpecError, expected
-from rsavatar.imaging import Actor, plan
+from rsavatar.imaging import Actor, Schedule, plan
 from rsavatar.motion.base import AbstractMotion, InitialMotion
 from rsavatar.motion.sequence import SequenceSpline
 from rsavatar.motion.spline import FrameSpline
 from rsavatar.motion.still import StillPose
 from rsavatar.optimization import POSE_FIRST, Rates, Settings
 from rsavatar.shutter.base import AbstractShutter
+from rsavatar.shutter.clock import ReadoutClock
 from rsavatar.spec import JobSpec
 from rsavatar.train import Observation
 
@@ -42,6 +43,13 @@ class Case:
         period = round(self.subject.timing.period_frames)
         bands = self.spec.bands(period)
         return period if bands == "scanline" else bands
+
+    @property
+    def exposure(self) -> float:
+        """How long a row is exposed, as a fraction of the readout; 0 where it is ignored or nothing is read out."""
+        timing, wanted = self.subject.timing, self.spec.exposure_frames
+        frames = timing.exposure_frames if wanted is None else wanted
+        return frames / timing.readout_frames if timing.readout_frames else 0.0
 
     def initial_motion(self) -> InitialMotion:
         """The per-frame fit and the frames' clock."""
@@ -97,6 +105,7 @@ def build_actor(method: AbstractMethod, case: Case) -> Actor:
     """The avatar at its start: Gaussians on the body's vertices, moving as the initial fit says."""
     torch.manual_seed(case.spec.seed)  # the networks' initial weights
     fit, lost = method.initial_fit(case), case.spec.ablation
+    unknown, timing = case.spec.calibrate, case.subject.timing
     surface = Surface(case.body, fit.shapes)
     motion = method.motion(case)
     return Actor(
@@ -105,6 +114,7 @@ def build_actor(method: AbstractMethod, case: Case) -> Actor:
         surface.pose_offsets(fit.poses),
         None if lost.no_pose_deformation or not list(motion.parameters()) else PoseResidual(),
         None if lost.no_lbs_refinement else SkinOffset(),
+        ReadoutClock(len(case.subject.training), timing.period_frames, unknown) if unknown else None,
     )
 
 
@@ -114,25 +124,37 @@ def observations(method: AbstractMethod, case: Case) -> list[Observation]:
     Raises:
         DataError: if an image cannot be read or every mask is empty.
     """
-    subject, shutter = case.subject, method.shutter(case)
-    found = []
-    for name in subject.training:
-        camera, trigger = subject.cameras[name], subject.timing.trigger(name)
-        slots = shutter.slots(camera.height, subject.timing.readout_frames, trigger)
-        for frame in range(subject.frames):
-            rgb, mask = subject.observe(name, frame)
-            box = body_box(mask)
-            if box is None:  # nobody in the picture: nothing to learn from it
-                continue
-            x0, y0, x1, y1 = box
-            pixels = torch.from_numpy(np.ascontiguousarray(rgb[y0:y1, x0:x1].transpose(2, 0, 1)))
-            coverage = torch.from_numpy(np.ascontiguousarray(mask[y0:y1, x0:x1]))
-            schedule = plan(slots, y0, y1)
-            cut = camera.cropped(x0, y0, x1, y1)
-            found.append(Observation(frame, cut, schedule, pixels, coverage, (camera.height, camera.width)))
+    subject = case.subject
+    views = [(name, frame) for name in subject.training for frame in range(subject.frames)]
+    there = [_observe(method, case, *view) for view in views if view not in subject.missing]
+    found = [observation for observation in there if observation is not None]
     if not found:
         raise DataError(expected(f"subject {subject.name}", "a training image with a body in its mask", "none"))
     return found
+
+
+def _observe(method: AbstractMethod, case: Case, name: str, frame: int) -> Observation | None:
+    """One training image; None where nobody is in it, so that there is nothing to learn from it."""
+    subject, camera = case.subject, case.subject.cameras[name]
+    rgb, mask = subject.observe(name, frame)
+    box = body_box(mask)
+    if box is None:
+        return None
+    x0, y0, x1, y1 = box
+    pixels = torch.from_numpy(np.ascontiguousarray(rgb[y0:y1, x0:x1].transpose(2, 0, 1)))
+    coverage = torch.from_numpy(np.ascontiguousarray(mask[y0:y1, x0:x1]))
+    schedule, cut = _schedule(method, case, name, (y0, y1)), camera.cropped(x0, y0, x1, y1)
+    return Observation(frame, cut, schedule, pixels, coverage, (camera.height, camera.width), f"{name}/{frame:06d}")
+
+
+def _schedule(method: AbstractMethod, case: Case, name: str, rows: tuple[int, int]) -> Schedule:
+    """When the ``rows`` [top, bottom) of camera ``name`` are exposed, as the method believes."""
+    height, timing, shutter = case.subject.cameras[name].height, case.subject.timing, method.shutter(case)
+    once, twice = (
+        plan(shutter.slots(height, readout, timing.trigger(name)), *rows)
+        for readout in (timing.readout_frames, 2 * timing.readout_frames)
+    )  # instants are affine in the readout: the difference is the part that is proportional to it
+    return replace(once, camera=case.subject.training.index(name), reading=twice.offsets - once.offsets)
 
 
 def body_box(mask: Bytes) -> tuple[int, int, int, int] | None:
@@ -167,4 +189,5 @@ def settings(case: Case) -> Settings:
         checkpoint_every=spec.checkpoint_every,
         density=(DensityRules() if authors else DensityRules(gradient=4e-4)) if spec.densify else None,
         rates=Rates() if authors else POSE_FIRST,
+        doubt=spec.doubt,
     )

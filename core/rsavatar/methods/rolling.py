@@ -16,8 +16,10 @@ class RollingShutterAvatar(AbstractMethod):
         return sub_frame_motion(case)
 
     def shutter(self, case: Case) -> AbstractShutter:
-        """Rows (eq. rs) or T bands of them (eq. rs_discrete); the mid instant for all without the shutter model."""
+        """Rows, blurred where exposed for long (eq. rs), or T bands (eq. rs_discrete); the mid instant with ``no_rs``."""
         if case.spec.ablation.no_rs:
             return Instant()
-        continuous = case.spec.T == "scanline"
-        return Scanline() if continuous else Bands(case.bands)
+        if case.spec.T != "scanline":
+            return Bands(case.bands)
+        exposure = case.exposure
+        return Scanline(exposure, case.spec.exposure_samples) if exposure else Scanline()
