@@ -8,6 +8,7 @@ from typing import Annotated, cast
 from celery import Celery
 from fastapi import Depends, Path, Request
 
+from services.api.drawings import Drawings
 from services.settings import Settings
 from services.store.session import Store
 
@@ -16,11 +17,12 @@ UUID = r"^[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}$"
 
 @dataclass(frozen=True)
 class Backend:
-    """Settings, database and broker of one application."""
+    """Settings, database, broker and drawings of one application."""
 
     settings: Settings
     store: Store
     broker: Celery
+    drawings: Drawings
 
 
 def backend(request: Request) -> Backend:

@@ -18,6 +18,7 @@ CORE_OF_API = (
     "rsavatar.grids",
 )
 CORE_OF_WORKER = ("rsavatar.experiment", "rsavatar.events", "rsavatar.spec", "rsavatar.errors")
+CORE_OF_RENDERER = ("rsavatar.export", "rsavatar.report", "rsavatar.spec", "rsavatar.errors")
 HEAVY = ("torch", "numpy", "scipy", "cv2", "matplotlib", "rsavatar.experiment", "rsavatar.render")
 
 
@@ -36,7 +37,9 @@ def within(module: str, packages: tuple[str, ...]) -> bool:
     return any(module == p or module.startswith(f"{p}.") for p in packages)
 
 
-@pytest.mark.parametrize("entry", ["services.api.app", "services.worker.app", "services.up", "services.demo"])
+@pytest.mark.parametrize(
+    "entry", ["services.api.app", "services.worker.app", "services.renderer.__main__", "services.up", "services.demo"]
+)
 def test_no_process_but_the_child_loads_the_numeric_core(entry: str) -> None:
     code = f"import {entry}, sys; print([m for m in {HEAVY!r} if m in sys.modules])"
     shown = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
@@ -50,7 +53,7 @@ def test_api_and_worker_do_not_know_each_other() -> None:
 
 
 def test_the_core_is_entered_by_its_doors() -> None:
-    doors = {"api": CORE_OF_API, "store": CORE_OF_API, "worker": CORE_OF_WORKER}
+    doors = {"api": CORE_OF_API, "store": CORE_OF_API, "worker": CORE_OF_WORKER, "renderer": CORE_OF_RENDERER}
     for part, allowed in doors.items():
         for file in (SERVICES / part).rglob("*.py"):
             core = {m for m in imports_of(file) if within(m, ("rsavatar",))} - {"rsavatar", "rsavatar.__version__"}
