@@ -6,7 +6,10 @@ ServiceError
 ├── BrokerError       no redis-server can be found, or it does not answer
 ├── NotFoundError     no such job, subject, artifact or table
 ├── ConflictError     the verb does not fit the job's state
+├── ForbiddenError    the caller may not do that
 ├── RequestError      a request contradicts the catalogue, or an earlier request with the same key
+├── RenderError       nothing can be drawn now: the render process does not start, or does not answer
+├── QuotaError        an owner has as many jobs as they may
 └── FencedError       this attempt no longer owns its job; nothing it says is stored
 """
 
@@ -45,8 +48,20 @@ class ConflictError(ServiceError):
     """The verb does not fit the job's state."""
 
 
+class ForbiddenError(ServiceError):
+    """The caller may not do that."""
+
+
 class RequestError(ServiceError):
     """A request contradicts the catalogue, or an earlier request with the same key."""
+
+
+class RenderError(ServiceError):
+    """Nothing can be drawn now: the render process does not start, has no turn, or does not answer."""
+
+
+class QuotaError(ServiceError):
+    """An owner has as many jobs as they may."""
 
 
 class FencedError(ServiceError):

@@ -34,23 +34,41 @@ class Settings(BaseSettings):
 
     host: str = Field(default="127.0.0.1", description="address that the API binds")
     port: int = Field(default=8000, ge=0, le=65535, description="port that the API binds")
-    allow_remote: bool = Field(default=False, description="bind an address other than loopback, without any login")
+    require_token: bool = Field(default=False, description="ask for tokens on loopback too; elsewhere they always are")
     allowed_hosts: Annotated[tuple[str, ...], NoDecode] = Field(
         default=(), description="more names that a Host header may say"
     )
-    max_body_bytes: int = Field(default=65_536, ge=1024, description="largest request body")
+    session_hours: float = Field(default=12.0, gt=0, description="time after which a browser logs in again")
+    requests_per_second: float = Field(default=50.0, gt=0, description="lasting pace of one token")
+    request_burst: float = Field(default=200.0, ge=1, description="requests that one token may send at once")
+    max_body_bytes: int = Field(default=65_536, ge=1024, description="largest request body, archives excepted")
+    max_upload_bytes: int = Field(default=4 << 30, ge=1024, description="largest archive of a subject, as sent")
+    max_subject_bytes: int = Field(default=8 << 30, ge=1024, description="largest subject, unpacked")
+    max_entry_bytes: int = Field(default=256 << 20, ge=1024, description="largest file of a subject")
+    max_entries: int = Field(default=50_000, ge=1, description="most files of a subject")
+    check_seconds: float = Field(default=600.0, gt=0, description="time that the check of a subject may take")
+    max_grid_jobs: int = Field(default=1000, ge=1, le=10_000, description="most jobs of one grid")
     ping_seconds: float = Field(default=15.0, gt=0, description="silence on an event stream before a comment is sent")
     poll_seconds: float = Field(default=0.4, gt=0, description="seconds between two looks of a stream at the store")
+
+    render_seconds: float = Field(default=120.0, gt=0, description="time that a drawing may take, its queue included")
+    render_idle_seconds: float = Field(default=600.0, gt=0, description="rest after which the render process ends")
+    drawings_mb: int = Field(default=512, ge=16, description="disk for finished drawings and exports")
 
     worker_concurrency: int = Field(default=1, ge=1, le=64, description="jobs that one worker trains at a time")
     threads_per_job: int = Field(default=0, ge=0, description="threads of one job; 0 = cores / worker_concurrency")
     memory_limit_mb: int = Field(default=0, ge=0, description="data segment of a job's process; 0 = unlimited")
+    max_queued_per_owner: int = Field(default=10_000, ge=0, description="jobs of one owner that may wait; 0 = any")
+    max_running_per_owner: int = Field(default=0, ge=0, description="jobs of one owner that may run at once; 0 = any")
     max_attempts: int = Field(default=3, ge=1, description="infrastructure failures that a job survives, plus one")
     lease_seconds: float = Field(default=75.0, gt=0, description="silence after which a worker's job is given away")
     heartbeat_seconds: float = Field(default=1.0, gt=0, description="seconds between two writes of a running job")
     stall_seconds: float = Field(default=900.0, gt=0, description="time without progress after which a job is killed")
     grace_seconds: float = Field(default=30.0, ge=0, description="seconds between asking a job to stop and killing it")
     backoff_seconds: float = Field(default=2.0, ge=0, description="wait before the first retry; doubles each time")
+    outage_seconds: float = Field(
+        default=300.0, ge=0, description="time for which a finished job's result is offered to an absent database"
+    )
     sweep_seconds: float = Field(default=5.0, gt=0, description="seconds between two rounds of the sweeper")
     unclaimed_seconds: float = Field(
         default=10.0, ge=0, description="age at which a waiting job's wake-up counts as lost"
@@ -110,6 +128,11 @@ class Settings(BaseSettings):
         return self.threads_per_job or max(1, (os.cpu_count() or 1) // self.worker_concurrency)
 
     @property
+    def needs_token(self) -> bool:
+        """Whether nobody is let in without a token: wherever others than this machine's user could ask."""
+        return self.require_token or self.host not in LOOPBACK or bool(self.allowed_hosts)
+
+    @property
     def url(self) -> str:
         """Where a browser on this machine finds the API."""
         host = f"[{self.host}]" if ":" in self.host else self.host
@@ -118,16 +141,6 @@ class Settings(BaseSettings):
     def job_dir(self, job_id: str) -> Path:
         """Folder of one job: checkpoint, outputs and log; the same for every attempt."""
         return self.home / "jobs" / job_id
-
-    def require_safe_bind(self) -> None:
-        """Refuse an address that other machines reach, unless the operator has said so.
-
-        Raises:
-            SettingsError: if ``host`` is not loopback and ``allow_remote`` is off.
-        """
-        if self.host not in LOOPBACK and not self.allow_remote:
-            wanted = "a loopback address (there is no login), or RSAVATAR_ALLOW_REMOTE=1 behind a proxy that has one"
-            raise SettingsError("RSAVATAR_HOST", wanted, self.host)
 
 
 def read_settings() -> Settings:
@@ -146,6 +159,6 @@ def read_settings() -> Settings:
 
 def make_home(settings: Settings) -> None:
     """Create the home and its folders, readable by their owner alone."""
-    inside = (settings.home / name for name in ("run", "jobs", "artifacts", "logs"))
+    inside = (settings.home / name for name in ("run", "jobs", "artifacts", "logs", "uploads", "subjects"))
     for folder in (settings.home, *inside, settings.socket.parent):
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)

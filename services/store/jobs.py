@@ -11,7 +11,8 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from services.errors import ConflictError, NotFoundError, RequestError
-from services.store import events
+from services.store import events, owners, reuse
+from services.store.filters import where
 from services.store.ids import new_id
 from services.store.records import RETRYABLE, Filters, Job, State, Submission
 from services.store.session import Store, db_now
@@ -29,8 +30,11 @@ def to_job(row: JobRow) -> Job:
 def submit(store: Store, submission: Submission) -> tuple[Job, bool]:
     """Accept a job; the second value says whether it is new. After the return the job cannot be lost.
 
+    Where a finished job has the same content, the new one has succeeded already, with its result.
+
     Raises:
         RequestError: if the idempotency key was used for another request.
+        QuotaError: if as many jobs of the owner wait as may.
     """
     try:
         return _submit(store, submission)
@@ -41,32 +45,26 @@ def submit(store: Store, submission: Submission) -> tuple[Job, bool]:
 def _submit(store: Store, submission: Submission) -> tuple[Job, bool]:
     with store.write() as session:
         if submission.idempotency_key is not None:
-            query = select(JobRow).where(JobRow.idempotency_key == submission.idempotency_key)
+            mine = (JobRow.owner == submission.owner) & (JobRow.idempotency_key == submission.idempotency_key)
+            query = select(JobRow).where(mine)
             if (earlier := session.scalar(query)) is not None:
                 if earlier.request_sha256 != submission.request_sha256:
                     raise RequestError("Idempotency-Key", "the request it was first used for", "another request")
                 return to_job(earlier), False
+        owners.require_room(session, store, submission.owner)
         row = JobRow(id=new_id(), created_at=session.scalar(select(db_now())), **_columns(submission))
         session.add(row)
         session.flush()
         events.append(session, row.id, [events.state_event(State.QUEUED)])
+        if reuse.adopt(session, row):
+            session.refresh(row)
         return to_job(row), True
 
 
 def _columns(submission: Submission) -> dict[str, Any]:
     spec = dict(submission.spec)
-    return {
-        "spec": spec,
-        "spec_sha256": submission.spec_sha256,
-        "method": spec["method"],
-        "subject": spec["subject"],
-        "priority": spec["priority"],
-        "grid_id": submission.grid_id,
-        "idempotency_key": submission.idempotency_key,
-        "request_sha256": submission.request_sha256,
-        "state": State.QUEUED,
-        "max_attempts": submission.max_attempts,
-    }
+    named = {name: spec[name] for name in ("method", "subject", "priority")}
+    return {**vars(submission), "spec": spec, **named, "state": State.QUEUED}
 
 
 def get(store: Store, job_id: str) -> Job:
@@ -87,15 +85,12 @@ def _row(session: Session, job_id: str) -> JobRow:
 
 
 def page(store: Store, filters: Filters, before: str | None, limit: int) -> list[Job]:
-    """Up to ``limit`` jobs older than the id ``before``, newest first."""
-    wanted = {
-        JobRow.state: filters.state,
-        JobRow.method: filters.method,
-        JobRow.subject: filters.subject,
-        JobRow.grid_id: filters.grid,
-    }
-    query = select(JobRow).order_by(JobRow.id.desc()).limit(limit)
-    query = query.where(*(column == value for column, value in wanted.items() if value is not None))
+    """Up to ``limit`` jobs older than the id ``before``, newest first.
+
+    Raises:
+        RequestError: if the query of ``filters`` cannot be understood, saying where.
+    """
+    query = select(JobRow).where(*where(filters)).order_by(JobRow.id.desc()).limit(limit)
     if before is not None:
         query = query.where(JobRow.id < before)
     with store.read() as session:
@@ -175,7 +170,8 @@ def retry(store: Store, job_id: str) -> Job:
         NotFoundError: if there is no such job.
         ConflictError: if the job has not ended, or has succeeded.
     """
-    fresh = {"failures": 0, "not_before": 0.0, "error": None, "error_kind": None, "finished_at": None}
+    fresh = {"failures": 0, "not_before": 0.0, "finished_at": None}
+    fresh |= dict.fromkeys(("error", "error_kind", "first_traceback"))
     with store.write() as session:
         row = _row(session, job_id)
         if row.state not in RETRYABLE:

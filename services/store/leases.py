@@ -15,38 +15,62 @@ from sqlalchemy import ColumnElement, case, func, insert, select, update
 from sqlalchemy.orm import Session
 
 from services.errors import FencedError
-from services.store import artifacts, events, metrics
+from services.store import artifacts, checkpoints, events, metrics, owners, reuse
 from services.store.records import Batch, Claim, Event, Failure, Look, Orders, Outcome, State
 from services.store.session import Store, db_now
 from services.store.tables import JobRow, SchedulerRow
 
 LONGEST_BACKOFF = 300.0
+LONGEST_TRACEBACK = 16_384  # characters; its end says most
 UNSEEN = {"synchronize_session": False}  # rows in memory need not follow an UPDATE
 IDLE = {"lease_owner": None, "lease_until": None, "cancel_requested_at": None, "pause_requested_at": None}
 DUE = (JobRow.state == State.QUEUED) & (JobRow.not_before <= db_now())
 
 
 def claim(store: Store, owner: str, lease_seconds: float) -> Claim | None:
-    """Take the most urgent job that may run now; None when there is none. A lost race looks for the next one."""
-    while True:
-        with store.write() as session:
-            queue = select(JobRow).where(DUE).order_by(JobRow.priority.desc(), JobRow.id).limit(1)
-            row = session.scalar(queue)
-            if row is None:
-                return None
-            unchanged = (JobRow.id == row.id) & (JobRow.attempt == row.attempt) & (JobRow.state == State.QUEUED)
-            values = {
-                "state": State.RUNNING,
-                "attempt": JobRow.attempt + 1,
-                "lease_owner": owner,
-                "lease_until": db_now() + lease_seconds,
-                "started_at": func.coalesce(JobRow.started_at, db_now()),
-            }
-            change = update(JobRow).where(unchanged).values(**values).returning(JobRow.attempt)
-            taken = session.scalar(change, execution_options=UNSEEN)
-            if taken is not None:
-                events.append(session, row.id, [events.state_event(State.RUNNING, attempt=taken)])
-                return Claim(row.id, taken, row.spec, row.subject)
+    """Take the most urgent job of the owner whose turn it is; None when no job may run now.
+
+    A job whose result has become known meanwhile is not taken but ends with it.
+    """
+    with store.write() as session:
+        for name in owners.by_turn(session):
+            if not owners.may_run(session, store, name):
+                continue
+            while (row := _first_due(session, name)) is not None:
+                if reuse.adopt(session, row):
+                    continue
+                if (taken := _take(session, row, owner, lease_seconds)) is not None:
+                    owners.note_served(session, name)
+                    return taken
+    return None
+
+
+def _first_due(session: Session, name: str) -> JobRow | None:
+    """In two look-ups of an index, highest priority first and then lowest id; rows that others hold are passed over."""
+    due = (DUE, JobRow.owner == name, reuse.NO_TWIN_RUNS)
+    top = session.scalar(select(JobRow.priority).where(*due).order_by(JobRow.priority.desc()).limit(1))
+    if top is None:
+        return None
+    query = select(JobRow).where(*due, JobRow.priority == top).order_by(JobRow.id).limit(1)
+    return session.scalar(query.with_for_update(skip_locked=True), execution_options={"populate_existing": True})
+
+
+def _take(session: Session, row: JobRow, owner: str, lease_seconds: float) -> Claim | None:
+    """Compare and set; None if somebody else was faster."""
+    unchanged = (JobRow.id == row.id) & (JobRow.attempt == row.attempt) & (JobRow.state == State.QUEUED)
+    values = {
+        "state": State.RUNNING,
+        "attempt": JobRow.attempt + 1,
+        "lease_owner": owner,
+        "lease_until": db_now() + lease_seconds,
+        "started_at": func.coalesce(JobRow.started_at, db_now()),
+    }
+    change = update(JobRow).where(unchanged).values(**values).returning(JobRow.attempt)
+    taken = session.scalar(change, execution_options=UNSEEN)
+    if taken is None:
+        return None
+    events.append(session, row.id, [events.state_event(State.RUNNING, attempt=taken)])
+    return Claim(row.id, taken, row.spec, row.subject, row.memory_limit_mb, row.stall_seconds)
 
 
 def beat(store: Store, claim: Claim, batch: Batch, lease_seconds: float) -> Orders:
@@ -56,11 +80,15 @@ def beat(store: Store, claim: Claim, batch: Batch, lease_seconds: float) -> Orde
         FencedError: if the job was given away; nothing of ``batch`` is stored.
     """
     values: dict[str, Any] = {"lease_until": db_now() + lease_seconds, **_columns(batch.look)}
+    if batch.rss_bytes is not None:
+        values["rss_bytes"] = batch.rss_bytes
     with store.write() as session:
         asked = _fenced(session, claim, values)
         events.append(session, claim.job_id, batch.events)
         metrics.put_points(session, claim.job_id, batch.points)
         artifacts.put(session, claim.job_id, batch.artifacts)
+        if batch.checkpoint is not None:
+            checkpoints.put(session, claim, batch.checkpoint)
         return asked
 
 
@@ -82,25 +110,30 @@ def _fenced(session: Session, claim: Claim, values: Mapping[str, Any]) -> Orders
     return Orders(row[0] is not None, row[1] is not None)
 
 
-def succeed(store: Store, claim: Claim, outcome: Outcome) -> None:
-    """End a job with its result: state, result, scores and artifacts in one transaction.
+def succeed(store: Store, claim: Claim, outcome: Outcome, content_sha256: str | None = None) -> None:
+    """End a job with its result: state, result, scores and artifacts in one transaction, that of waiting twins as well.
+
+    ``content_sha256`` is of what was really used, where that is known; data may have changed since the submission.
 
     Raises:
         FencedError: if the job was given away; nothing is stored.
     """
     columns = {"psnr": outcome.means.get("psnr"), "gaussians": outcome.gaussians, "eta_seconds": 0.0}
     ended = {"finished_at": db_now(), "error": None, "error_kind": None}
+    content = {} if content_sha256 is None else {"content_sha256": content_sha256}
     with store.write() as session:
-        _fenced(session, claim, {"state": State.SUCCEEDED, **ended, **IDLE, **columns})
+        _fenced(session, claim, {"state": State.SUCCEEDED, **ended, **IDLE, **columns, **content})
         metrics.put_outcome(session, claim, outcome)
         artifacts.put(session, claim.job_id, outcome.artifacts)
+        checkpoints.forget(session, claim.job_id)
         events.append(session, claim.job_id, [events.state_event(State.SUCCEEDED, means=dict(outcome.means))])
+        reuse.adopt_followers(session, claim.job_id)
 
 
-def fail(store: Store, claim: Claim, kind: Failure, message: str, backoff: float) -> State:
+def fail(store: Store, claim: Claim, kind: Failure, message: str, backoff: float, traceback: str = "") -> State:
     """End an attempt badly. Infrastructure failures wait and try again until the attempts are used up, then ``dead``.
 
-    Of several infrastructure failures the first message is kept on the job: it is the one that explains.
+    Of several failures the first message and the first traceback are kept on the job: they are the ones that explain.
 
     Raises:
         FencedError: if the job was given away.
@@ -109,8 +142,10 @@ def fail(store: Store, claim: Claim, kind: Failure, message: str, backoff: float
     with store.write() as session:
         row = session.get_one(JobRow, claim.job_id)
         keep = retry and row.error is not None
-        error = {} if keep else {"error_kind": str(kind), "error": message}
-        values = error | _after_failure(row, backoff, retry=retry)
+        values: dict[str, Any] = {} if keep else {"error_kind": str(kind), "error": message}
+        if row.first_traceback is None and traceback:
+            values["first_traceback"] = traceback[-LONGEST_TRACEBACK:]
+        values |= _after_failure(row, backoff, retry=retry)
         _fenced(session, claim, values)
         state = State(values["state"])
         events.append(session, claim.job_id, [events.state_event(state, reason=message, failure=str(kind))])
@@ -166,6 +201,7 @@ def _take_back(store: Store, condition: ColumnElement[bool], reason: str, backof
         lost = select(JobRow).where((JobRow.state == State.RUNNING) & condition).with_for_update(skip_locked=True)
         for row in session.scalars(lost).all():
             message = f"{reason}: {row.lease_owner}, attempt {row.attempt}, step {row.step} of {row.steps}"
+            message += "" if row.rss_bytes is None else f", {row.rss_bytes >> 20} MB resident"
             values = _after_failure(row, backoff, retry=True)
             error = {"error_kind": str(Failure.INFRASTRUCTURE), "error": message} if row.error is None else {}
             claim = Claim(row.id, row.attempt, row.spec, row.subject)
@@ -176,8 +212,8 @@ def _take_back(store: Store, condition: ColumnElement[bool], reason: str, backof
     return waiting
 
 
-def owners(store: Store) -> list[str]:
-    """Owners of the running jobs."""
+def holders(store: Store) -> list[str]:
+    """Workers that hold the leases of the running jobs."""
     with store.read() as session:
         query = select(JobRow.lease_owner).where(JobRow.state == State.RUNNING, JobRow.lease_owner.is_not(None))
         return [str(owner) for owner in session.scalars(query.distinct())]

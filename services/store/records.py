@@ -54,12 +54,19 @@ class Job:
     subject: str
     priority: int
     grid_id: str | None
+    owner: str
+    notes: str
     idempotency_key: str | None
     request_sha256: str
+    content_sha256: str | None
+    forced: bool
+    reused_from: str | None
     state: str
     attempt: int
     failures: int
     max_attempts: int
+    memory_limit_mb: int | None
+    stall_seconds: float | None
     lease_owner: str | None
     lease_until: float | None
     not_before: float
@@ -67,6 +74,7 @@ class Job:
     pause_requested_at: float | None
     error_kind: str | None
     error: str | None
+    first_traceback: str | None
     stage: str | None
     step: int
     steps: int
@@ -74,6 +82,7 @@ class Job:
     psnr: float | None
     gaussians: int | None
     eta_seconds: float | None
+    rss_bytes: int | None
     created_at: float
     started_at: float | None
     finished_at: float | None
@@ -81,7 +90,11 @@ class Job:
 
 @dataclass(frozen=True)
 class Submission:
-    """A job to be."""
+    """A job to be. Its fields are columns of the job.
+
+    With ``content_sha256`` (of spec, data and code) a finished job of the same content gives its result at once, unless
+    ``forced``.
+    """
 
     spec: Mapping[str, Any]
     spec_sha256: str
@@ -89,6 +102,12 @@ class Submission:
     max_attempts: int
     idempotency_key: str | None = None
     grid_id: str | None = None
+    owner: str = "local"
+    notes: str = ""
+    content_sha256: str | None = None
+    forced: bool = False
+    memory_limit_mb: int | None = None
+    stall_seconds: float | None = None
 
 
 @dataclass(frozen=True)
@@ -99,6 +118,7 @@ class Filters:
     method: str | None = None
     subject: str | None = None
     grid: str | None = None
+    query: str | None = None  # in the language of services.store.query
 
 
 @dataclass(frozen=True)
@@ -109,6 +129,8 @@ class Claim:
     attempt: int
     spec: Mapping[str, Any]
     subject: str
+    memory_limit_mb: int | None = None
+    stall_seconds: float | None = None
 
 
 @dataclass(frozen=True)
@@ -155,6 +177,15 @@ class Look:
 
 
 @dataclass(frozen=True)
+class Checkpoint:
+    """A stored checkpoint: the state after ``step``, in bytes of this hash."""
+
+    step: int
+    sha256: str
+    size: int
+
+
+@dataclass(frozen=True)
 class Batch:
     """What a running job says in one transaction; an empty one is a heartbeat."""
 
@@ -162,6 +193,8 @@ class Batch:
     points: Sequence[Point] = ()
     artifacts: Sequence[Artifact] = ()
     look: Look | None = None
+    rss_bytes: int | None = None
+    checkpoint: Checkpoint | None = None
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,14 @@ def _now_postgresql(element: Any, compiler: Any, **options: Any) -> str:
     return "extract(epoch from clock_timestamp())::double precision"
 
 
+@dataclass(frozen=True)
+class Quota:
+    """Most jobs of one owner that may wait and run at a time; 0 = no limit."""
+
+    queued: int
+    running: int
+
+
 class Store:
     """A database. ``read`` and ``write`` give a session inside one transaction; ``write`` commits at the end.
 
@@ -49,6 +58,7 @@ class Store:
     def __init__(self, settings: Settings) -> None:
         self.engine = open_engine(settings.database)
         self.artifacts_dir: Path = settings.home / "artifacts"
+        self.quota = Quota(settings.max_queued_per_owner, settings.max_running_per_owner)
         self._writer = self.engine.execution_options(immediate=True)
 
     @contextmanager

@@ -32,7 +32,7 @@ def alive_file(settings: Settings) -> Path:
 
 def sweep(settings: Settings, store: Store, app: Celery, owner: str) -> None:
     """One round. Does nothing while another worker has the duty."""
-    dead = [other for other in leases.owners(store) if is_surely_dead(other)]
+    dead = [other for other in leases.holders(store) if is_surely_dead(other)]
     if dead:  # needs no duty: the proof is local to this host, and taking back is fenced
         for job_id in leases.reclaim(store, dead):
             jobs.enqueue(app, job_id)

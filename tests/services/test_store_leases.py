@@ -112,7 +112,7 @@ def test_dead_owners_are_taken_back_at_once_and_others_are_not(store: Store) -> 
     first, second = submit(store), submit(store)
     take(store, owner="dead")
     take(store, owner="alive")
-    assert sorted(leases.owners(store)) == ["alive", "dead"]
+    assert sorted(leases.holders(store)) == ["alive", "dead"]
     assert leases.reclaim(store, ["dead"]) == [first.id]
     assert jobs.get(store, second.id).state == "running"
 
