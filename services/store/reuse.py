@@ -49,6 +49,8 @@ def finished(session: Session, content_sha256: str) -> JobRow | None:
 def adopt_followers(session: Session, job_id: str) -> list[str]:
     """End the waiting twins of a job that has just succeeded; returns their ids."""
     source = session.get_one(JobRow, job_id, populate_existing=True)
+    if source.content_sha256 is None:
+        return []
     same = (JobRow.content_sha256 == source.content_sha256) & (JobRow.state == State.QUEUED) & ~JobRow.forced
     twins = session.scalars(select(JobRow.id).where(same, JobRow.id != job_id).with_for_update(skip_locked=True)).all()
     return _end(session, twins, source)
