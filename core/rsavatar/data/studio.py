@@ -38,13 +38,16 @@ SUB_INSTANTS = 8 * PERIOD + 1
 _ROW_TIME = "t(v) = mid + delta_c + gamma*K*(v/H - 1/2), v = 0..H-1, source-frame units"
 
 
-def studio_subject_dir(seed: int = 0) -> Path:
-    """Folder of the studio subject of a seed, built into the cache when it is not there yet; built once only."""
-    name = "studio" if seed == 0 else f"studio-{seed}"
+def studio_subject_dir(seed: int = 0, exposure: float = 0.0) -> Path:
+    """Folder of the studio subject of a seed, built into the cache when it is not there yet; built once only.
+
+    ``exposure`` of every row of the rolling-shutter frames, in source frames; the sharp frames stay sharp.
+    """
+    name = ("studio" if seed == 0 else f"studio-{seed}") + (f"-exposed-{exposure:g}" if exposure else "")
     out = cache_dir() / f"studio-{FORMAT}-{SIZE}x{FRAMES}-anny-{anny_version()}-{BODY_FORMAT}" / name
     out.parent.mkdir(exist_ok=True)
     with _locked(out.parent / f"{name}.lock"):
-        return build(out, seed=seed)
+        return _built(out, _settings(seed, SIZE, FRAMES, GAMMA, exposure), silent)
 
 
 def build(
@@ -66,18 +69,29 @@ def build(
     Raises:
         DataError: if ``out`` holds anything else, or a number is out of range.
     """
-    if min(size, frames) < 1 or gamma < 0:
-        raise DataError(expected("studio size, frames and gamma", "at least 1, 1 and 0", (size, frames, gamma)))
+    return _built(out, _settings(seed, size, frames, gamma), report)
+
+
+def _settings(seed: int, size: int, frames: int, gamma: float, exposure: float = 0.0) -> dict[str, int | float]:
+    """What decides a studio subject; a row's exposure is named where there is one."""
+    if min(size, frames) < 1 or min(gamma, exposure) < 0:
+        got = (size, frames, gamma, exposure)
+        raise DataError(expected("studio size, frames, gamma and exposure", "at least 1, 1, 0 and 0", got))
     settings = {"format": FORMAT, "seed": seed, "size": size, "frames": frames, "gamma": gamma}
+    return settings | ({"exposure": exposure} if exposure else {})
+
+
+def _built(out: Path, settings: dict[str, int | float], report: Report) -> Path:
     if _is_built(out, settings):
         return out
+    seed, size, frames = (int(settings[name]) for name in ("seed", "size", "frames"))
     out.parent.mkdir(parents=True, exist_ok=True)
     part = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}-"))
     try:
         stage = set_stage(seed, size)
         mids = np.arange(1, frames + 1, dtype=np.float64) * PERIOD + PERIOD // 2
-        readout = gamma * PERIOD
-        _write_pictures(part, stage, mids, readout, report)
+        readout = settings["gamma"] * PERIOD
+        _write_pictures(part, stage, mids, (readout, settings.get("exposure", 0.0)), report)
         fit = _write_numbers(part, stage, mids, readout, seed)
         save_body(part / "body.npz", stage.body)
         _write_meta(part, stage, mids, settings, fit)
@@ -88,12 +102,14 @@ def build(
     return out
 
 
-def _write_pictures(root: Path, stage: Stage, mids: Array, readout: float, report: Report) -> None:
+def _write_pictures(root: Path, stage: Stage, mids: Array, shutter: tuple[float, float], report: Report) -> None:
+    """``shutter`` is the readout and the exposure of the rolling-shutter frames, source frames."""
     begun = time.monotonic()
     size = stage.cameras[0].height
     everyone = sorted(TRAINING + HELD_OUT)
     for n, mid in enumerate(mids):
-        rolling = stage.pictures([stage.cameras[c] for c in TRAINING], row_times(mid, readout, size))
+        readout, exposure = shutter
+        rolling = stage.exposed([stage.cameras[c] for c in TRAINING], row_times(mid, readout, size), exposure)
         sharp = stage.pictures([stage.cameras[c] for c in everyone], np.full(size, mid))
         for folder, cameras, images in (("images", TRAINING, rolling), ("gt", everyone, sharp)):
             masks = "mask" if folder == "images" else "gt_mask"

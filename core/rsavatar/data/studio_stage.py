@@ -8,13 +8,14 @@ import numpy as np
 
 from rsavatar.body.anny import anny_body
 from rsavatar.body.base import BodyModel
-from rsavatar.data.base import Array, BodyFit, Image
+from rsavatar.data.base import Array, BodyFit, Bytes, Image
 from rsavatar.data.studio_motion import Motion, bones, choose_motion, pose_meshes, skinning_table
 from rsavatar.data.studio_paint import WARDROBES, painter
 from rsavatar.data.studio_render import Paint, Strip, draw
 from rsavatar.geometry.cameras import Camera
 
 TRAINING, HELD_OUT = (0, 2, 4, 6), (1, 3, 5, 7)
+EXPOSED = 16  # instants that the exposure of a row is the mean of
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +39,20 @@ class Stage:
         meshes = pose_meshes(self.table, bones(self.body, self.motion.at(times[starts]))[0])
         strips = [Strip(int(lo), int(hi), mesh) for lo, hi, mesh in zip(starts, ends, meshes, strict=True)]
         return [draw(strips, self.body.faces, camera, self.paint) for camera in cameras]
+
+    def exposed(self, cameras: list[Camera], times: Array, exposure: float) -> list[Image]:
+        """The mean of pictures over an ``exposure`` in source frames that is centred on every row's time."""
+        if not exposure:
+            return self.pictures(cameras, times)
+        shifts = exposure * ((np.arange(EXPOSED) + 0.5) / EXPOSED - 0.5)
+        shots = [self.pictures(cameras, times + shift) for shift in shifts]
+        views = range(len(cameras))
+        return [(_mean([shot[k][0] for shot in shots]), _mean([shot[k][1] for shot in shots])) for k in views]
+
+
+def _mean(images: list[Bytes]) -> Bytes:
+    mean: Bytes = np.floor(np.mean(images, axis=0) + 0.5).astype(np.uint8)
+    return mean
 
 
 def set_stage(seed: int, size: int) -> Stage:
