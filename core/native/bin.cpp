@@ -74,7 +74,8 @@ static void merge(const std::vector<float> &key, int32_t *entry, int32_t *pair) 
 
 // Within the strip, depth is z + dz/dtau (tau of the strip's middle - own tau): nearly the order that is there already,
 // so insertion sort, which is stable; where it is not (splats that fly past each other), a merge sort goes on from there.
-static void resort(const RsFrame &frame, Slot &slot, int strip) {
+void resort(const RsFrame &frame, Slot &slot, int strip) {
+    if (slot.rows.rate == 0.f || frame.options.flags & RS_NO_RESORT) return;
     int r0 = slot.rows.lo + strip * frame.options.strip_rows, r1 = std::min(r0 + frame.options.strip_rows, slot.rows.hi);
     float tau = slot.rows.rate * 0.5f * (r0 + r1) + slot.rows.start;
     int begin = slot.strip_begin[strip], n = slot.strip_begin[strip + 1] - begin;
@@ -130,6 +131,4 @@ void bin(RsFrame &frame, int index, int count) {
             slot.entry_splat[at] = k, slot.entry_pair[at] = pair;
         }
     }
-    if (slot.rows.rate != 0.f && !(frame.options.flags & RS_NO_RESORT))
-        for (int strip = 0; strip < slot.strips; strip++) resort(frame, slot, strip);
 }

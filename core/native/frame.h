@@ -63,6 +63,7 @@ struct RsFrame {
 
 void project(RsFrame &frame, const RsGaussians &gaussians, const float *pose, int slot, int begin, int end);
 void bin(RsFrame &frame, int slot, int count);
+void resort(const RsFrame &frame, Slot &slot, int strip);
 void raster(RsFrame &frame, float *rgb, float *transmittance);
 void raster_backward(RsFrame &frame, const float *rgb, const float *transmittance, const float *grad_rgb,
                      const float *grad_transmittance);

@@ -71,15 +71,19 @@ struct Blend {
 };
 
 static inline void blend_pose(const Block &block, const RsGaussians &g, const float *pose, int D, Blend &out) {
-    for (int d = 0; d < D; d++)
-        for (int m = 0; m < 12; m++) out.c[d][m] = Floats{};
+    Floats weights[JOINTS];
+    int joints[JOINTS], used = 0;  // most blocks are bound to two or three
     for (int j = 0; j < JOINTS; j++) {
         Floats w = block.get(g.skin_weights + (size_t)j * g.count);
-        if (!any(w != 0.f)) continue;
-        for (int d = 0; d < D; d++) {
-            const float *a = pose + ((size_t)d * JOINTS + j) * 12;
-            for (int m = 0; m < 12; m++) out.c[d][m] += w * a[m];
+        if (any(w != 0.f)) weights[used] = w, joints[used++] = j;
+    }
+    for (int d = 0; d < D; d++) {
+        Floats c[12] = {};
+        for (int k = 0; k < used; k++) {
+            const float *a = pose + ((size_t)d * JOINTS + joints[k]) * 12;
+            for (int m = 0; m < 12; m++) c[m] += weights[k] * a[m];
         }
+        for (int m = 0; m < 12; m++) out.c[d][m] = c[m];
     }
 }
 

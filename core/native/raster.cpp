@@ -33,33 +33,66 @@ static Canvas open_canvas(const RsFrame &frame, const Slot &slot, int strip, int
     return c;
 }
 
-// One splat over one row's vector: where it counts, with which alpha and weight; steps the transmittance.
-struct Hit {
-    Ints use;             // contributes
-    Floats raw, alpha;    // before and after the cap
-    Floats weight;        // T alpha, 0 where unused
-};
-
+// What bounds an alpha and a transmittance.
 struct Limits {
-    float cut;  // log2(alpha_min)
-    Floats alpha_max;
-    float transmittance_min;
-    explicit Limits(const RsOptions &o) : cut(std::log2(o.alpha_min)), alpha_max(splat(o.alpha_max)), transmittance_min(o.transmittance_min) {}
+    Floats cut;  // log2(alpha_min)
+    Floats alpha_max, transmittance_min;
+    explicit Limits(const RsOptions &o)
+        : cut(splat(std::log2(o.alpha_min))), alpha_max(splat(o.alpha_max)), transmittance_min(splat(o.transmittance_min)) {}
 };
 
+// One splat over one row's vector.
+struct Hit {
+    Floats raw, alpha, weight;  // exp2(power); capped, 0 where it does not count; T alpha
+};
+
+// Takes a splat's alpha off the transmittance at t; false where no pixel is reached. A pixel whose transmittance would fall
+// under the minimum stops: its T turns negative, so that `after` stays under the minimum for all that comes behind.
 static inline bool step(Floats power, float *t, const Limits &limits, Hit &hit) {
-    Floats T = load(t);
-    Ints reached = (power >= limits.cut) & (T > 0.f);
+    Ints reached = power >= limits.cut;
     if (!any(reached)) return false;
+    Floats T = load(t);
     hit.raw = exp2(power);
-    hit.alpha = minimum(hit.raw, limits.alpha_max);
-    Floats weight = T * hit.alpha, after = T - weight;
-    Ints stop = after < limits.transmittance_min;
-    hit.use = reached & ~stop;
-    hit.weight = keep(hit.use, weight);
-    store(t, select(reached, select(stop, -T, after), T));
+    Floats alpha = keep(reached, minimum(hit.raw, limits.alpha_max)), weight = T * alpha, after = T - weight;
+    Ints live = after >= limits.transmittance_min;
+    hit.alpha = keep(live, alpha), hit.weight = keep(live, weight);
+    store(t, select(live, after, negative(T)));
     return true;
 }
+
+// A splat's rows within a canvas, as the walks below take them: N vectors a row. Up to four, the compiler unrolls them,
+// and no branch depends on the width; N = 0 stands for any number.
+constexpr int MOST_UNROLLED = 4;
+
+template <template <int> class Walk, class... Arguments> static inline void walk(const Splat &s, const Canvas &c, Arguments &&...rest) {
+    switch ((s.x_hi - s.x_lo + LANES - 1) / LANES) {
+    case 1: return Walk<1>::run(s, c, rest...);
+    case 2: return Walk<2>::run(s, c, rest...);
+    case 3: return Walk<3>::run(s, c, rest...);
+    case MOST_UNROLLED: return Walk<MOST_UNROLLED>::run(s, c, rest...);
+    default: return Walk<0>::run(s, c, rest...);
+    }
+}
+
+template <int N> struct Blend {
+    static void run(const Splat splat, const Canvas &c, const Limits &limits) {
+        const int y1 = std::min<int>(c.r1, splat.y_hi), x0 = splat.x_lo, vectors = N ? N : (splat.x_hi - x0 + LANES - 1) / LANES;
+        const size_t plane = c.plane, row = c.row;
+        int y = std::max<int>(c.r0, splat.y_lo);
+        for (float *line = c.at(y, x0); y < y1; y++, line += row) {
+            float dy = y + 0.5f - splat.v, constant = splat.qyy * dy * dy + splat.log2_opacity;
+            Floats dx = CENTRES + (x0 - (splat.u - splat.tilt * dy));
+            float *t = line;
+            for (int i = 0; i < vectors; i++, t += LANES, dx += (float)LANES) {
+                Hit hit;
+                if (!step(dx * dx * splat.qxx + constant, t, limits, hit)) continue;
+                store(t + R_PLANE * plane, load(t + R_PLANE * plane) + hit.weight * splat.r);
+                store(t + G_PLANE * plane, load(t + G_PLANE * plane) + hit.weight * splat.g);
+                store(t + B_PLANE * plane, load(t + B_PLANE * plane) + hit.weight * splat.b);
+            }
+        }
+    }
+};
 
 static void blend_strip(const RsFrame &frame, const Slot &slot, int strip, const Canvas &c) {
     const Limits limits(frame.options);
@@ -67,37 +100,21 @@ static void blend_strip(const RsFrame &frame, const Slot &slot, int strip, const
         float *t = c.at(y, c.x0);
         std::fill(t, t + c.plane, 1.f), std::fill(t + c.plane, t + FORWARD_PLANES * c.plane, 0.f);
     }
-    for (int e = slot.strip_begin[strip]; e < slot.strip_begin[strip + 1]; e++) {
-        const Splat &s = slot.splats[slot.entry_splat[e]];
-        int y0 = std::max<int>(c.r0, s.y_lo), y1 = std::min<int>(c.r1, s.y_hi);
-        for (int y = y0; y < y1; y++) {
-            float dy = y + 0.5f - s.v, ridge = s.u - s.tilt * dy, constant = s.qyy * dy * dy + s.log2_opacity;
-            for (int x = s.x_lo; x < s.x_hi; x += LANES) {
-                Floats dx = CENTRES + (x - ridge);
-                Hit hit;
-                float *t = c.at(y, x);
-                if (!step(dx * dx * s.qxx + constant, t, limits, hit)) continue;
-                store(t + R_PLANE * c.plane, load(t + R_PLANE * c.plane) + hit.weight * s.r);
-                store(t + G_PLANE * c.plane, load(t + G_PLANE * c.plane) + hit.weight * s.g);
-                store(t + B_PLANE * c.plane, load(t + B_PLANE * c.plane) + hit.weight * s.b);
-            }
-        }
-    }
+    for (int e = slot.strip_begin[strip]; e < slot.strip_begin[strip + 1]; e++)
+        walk<Blend>(slot.splats[slot.entry_splat[e]], c, limits);
 }
 
-// Adds weight * canvas to the image's rows; the first slot of a group sets them.
+// weight * canvas, on rows of the image: the first slot of a group sets them, the others add.
 static void emit(const RsFrame &frame, const Canvas &c, float weight, bool first, float *rgb, float *transmittance) {
-    int W = frame.camera.width;
-    size_t HW = (size_t)frame.camera.height * W;
+    size_t W = frame.camera.width, HW = frame.camera.height * W;
+    auto put = [first](float *out, float value) { *out = first ? value : *out + value; };
     for (int y = c.r0; y < c.r1; y++) {
-        float *out[4] = {transmittance + (size_t)y * W, rgb + (size_t)y * W, rgb + HW + (size_t)y * W, rgb + 2 * HW + (size_t)y * W};
-        if (first)
-            for (float *row : out) std::fill(row, row + W, 0.f);
-        for (int x = 0; x < c.x0; x++) out[0][x] += weight;
-        for (int x = c.x1; x < W; x++) out[0][x] += weight;
+        float *out[4] = {transmittance + y * W, rgb + y * W, rgb + HW + y * W, rgb + 2 * HW + y * W};
         for (int p = 0; p < 4; p++) {
-            const float *in = c.at(y, c.x0) + p * c.plane;
-            for (int x = c.x0; x < c.x1; x++) out[p][x] += weight * (p ? in[x - c.x0] : std::fabs(in[x - c.x0]));
+            const float *in = c.at(y, c.x0) + p * c.plane, outside = p ? 0.f : weight;
+            for (int x = 0; x < c.x0; x++) put(out[p] + x, outside);
+            for (int x = c.x0; x < c.x1; x++) put(out[p] + x, weight * (p ? in[x - c.x0] : std::fabs(in[x - c.x0])));
+            for (size_t x = c.x1; x < W; x++) put(out[p] + x, outside);
         }
     }
 }
@@ -112,9 +129,11 @@ void raster(RsFrame &frame, float *rgb, float *transmittance) {
         for (int task = 0; task < tasks; task++) attempt([&, task] {
             const Group &group = frame.groups[frame.tasks[task].first];
             for (int k = 0; k < group.slots; k++) {
-                const Slot &slot = frame.slots[group.first_slot + k];
-                Canvas c = open_canvas(frame, slot, frame.tasks[task].second, FORWARD_PLANES, buffer);
-                blend_strip(frame, slot, frame.tasks[task].second, c);
+                Slot &slot = frame.slots[group.first_slot + k];
+                const int strip = frame.tasks[task].second;
+                resort(frame, slot, strip);
+                Canvas c = open_canvas(frame, slot, strip, FORWARD_PLANES, buffer);
+                blend_strip(frame, slot, strip, c);
                 emit(frame, c, slot.rows.weight, k == 0, rgb, transmittance);
             }
         });
@@ -149,30 +168,34 @@ static void open_gradient(const RsFrame &frame, const Slot &slot, const Canvas &
 }
 
 // Moments of one splat over one strip. dL/dalpha = T (c . g) - rest_after / (1 - alpha).
-static void splat_moments(const Splat &s, const Canvas &c, const Limits &limits, float *out) {
-    Floats m0 = {}, mx = {}, my = {}, mxx = {}, mxy = {}, myy = {}, mr = {}, mg = {}, mb = {};
-    int y0 = std::max<int>(c.r0, s.y_lo), y1 = std::min<int>(c.r1, s.y_hi);
-    for (int y = y0; y < y1; y++) {
-        float dy = y + 0.5f - s.v, ridge = s.u - s.tilt * dy, constant = s.qyy * dy * dy + s.log2_opacity;
-        Floats row0 = {}, rowx = {};
-        for (int x = s.x_lo; x < s.x_hi; x += LANES) {
-            Floats dx = CENTRES + (x - ridge);
-            Hit hit;
-            float *t = c.at(y, x);
-            if (!step(dx * dx * s.qxx + constant, t, limits, hit)) continue;
-            Floats gr = load(t + GR_PLANE * c.plane), gg = load(t + GG_PLANE * c.plane), gb = load(t + GB_PLANE * c.plane);
-            Floats shade = gr * s.r + gg * s.g + gb * s.b, rest = load(t + REST_PLANE * c.plane) - hit.weight * shade;
-            store(t + REST_PLANE * c.plane, rest);
-            mr += hit.weight * gr, mg += hit.weight * gg, mb += hit.weight * gb;
-            Floats g = keep(hit.use & (hit.raw <= limits.alpha_max), hit.weight * shade - hit.alpha * rest / (1.f - hit.alpha));
-            Floats gx = g * dx;
-            row0 += g, rowx += gx, mxx += gx * dx;
+template <int N> struct Moments {
+    static void run(const Splat splat, const Canvas &c, const Limits &limits, float *out) {
+        const int y1 = std::min<int>(c.r1, splat.y_hi), x0 = splat.x_lo, vectors = N ? N : (splat.x_hi - x0 + LANES - 1) / LANES;
+        const size_t plane = c.plane, row = c.row;
+        Floats m0 = {}, mx = {}, my = {}, mxx = {}, mxy = {}, myy = {}, mr = {}, mg = {}, mb = {};
+        int y = std::max<int>(c.r0, splat.y_lo);
+        for (float *line = c.at(y, x0); y < y1; y++, line += row) {
+            float dy = y + 0.5f - splat.v, constant = splat.qyy * dy * dy + splat.log2_opacity;
+            Floats dx = CENTRES + (x0 - (splat.u - splat.tilt * dy)), row0 = {}, rowx = {};
+            float *t = line;
+            for (int i = 0; i < vectors; i++, t += LANES, dx += (float)LANES) {
+                Hit hit;
+                if (!step(dx * dx * splat.qxx + constant, t, limits, hit)) continue;
+                Floats gr = load(t + GR_PLANE * plane), gg = load(t + GG_PLANE * plane), gb = load(t + GB_PLANE * plane);
+                Floats shaded = hit.weight * (gr * splat.r + gg * splat.g + gb * splat.b), rest = load(t + REST_PLANE * plane) - shaded;
+                store(t + REST_PLANE * plane, rest);
+                mr += hit.weight * gr, mg += hit.weight * gg, mb += hit.weight * gb;
+                Floats g = keep(hit.raw <= limits.alpha_max, shaded - hit.alpha * rest / (1.f - hit.alpha));
+                Floats gx = g * dx;
+                row0 += g, rowx += gx, mxx += gx * dx;
+            }
+            m0 += row0, mx += rowx, my += row0 * dy, mxy += rowx * dy, myy += row0 * (dy * dy);
         }
-        m0 += row0, mx += rowx, my += row0 * dy, mxy += rowx * dy, myy += row0 * (dy * dy);
+        const Floats all[MOMENTS] = {m0, mx, my, mxx, mxy, myy, mr, mg, mb};
+        static_assert(MOMENTS == 9, "eight and one");
+        sum_eight(all, out), out[8] = sum(all[8]);
     }
-    const Floats all[MOMENTS] = {m0, mx, my, mxx, mxy, myy, mr, mg, mb};
-    for (int m = 0; m < MOMENTS; m++) out[m] = sum(all[m]);
-}
+};
 
 void raster_backward(RsFrame &frame, const float *rgb, const float *transmittance, const float *grad_rgb, const float *grad_transmittance) {
     int tasks = frame.tasks.size();
@@ -196,7 +219,7 @@ void raster_backward(RsFrame &frame, const float *rgb, const float *transmittanc
                 }
                 open_gradient(frame, slot, c, averaged ? &own : nullptr, rgb, transmittance, grad_rgb, grad_transmittance);
                 for (int e = slot.strip_begin[strip]; e < slot.strip_begin[strip + 1]; e++)
-                    splat_moments(slot.splats[slot.entry_splat[e]], c, limits, &slot.moments[(size_t)slot.entry_pair[e] * 16]);
+                    walk<Moments>(slot.splats[slot.entry_splat[e]], c, limits, &slot.moments[(size_t)slot.entry_pair[e] * 16]);
             }
         });
     }

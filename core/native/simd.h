@@ -31,9 +31,11 @@ static inline Floats load(const float *p) {
 
 static inline void store(float *p, Floats v) { memcpy(p, &v, sizeof v); }
 
-static inline Floats select(Ints mask, Floats a, Floats b) { return (Floats)((mask & (Ints)a) | (~mask & (Ints)b)); }
+static inline Floats select(Ints mask, Floats a, Floats b) { return mask ? a : b; }
 
 static inline Floats keep(Ints mask, Floats a) { return (Floats)(mask & (Ints)a); }
+
+static inline Floats negative(Floats a) { return (Floats)((Ints)a | INT32_MIN); }  // -|a|
 
 static inline bool any(Ints mask) {
 #if defined(__AVX512F__) && RS_LANES == 16
@@ -80,6 +82,34 @@ static inline float sum(Floats v) {
     for (int width = LANES / 2; width; width /= 2)
         for (int i = 0; i < width; i++) a[i] += a[i + width];
     return a[0];
+}
+
+typedef float Eight __attribute__((vector_size(32)));
+
+static inline Eight halved(Floats v) {  // to eight lanes
+#if RS_LANES == 16
+    Eight half[2];
+    memcpy(half, &v, sizeof half);
+    return half[0] + half[1];
+#else
+    return v;
+#endif
+}
+
+// Sums of the lanes of eight vectors, to eight floats: pairs of vectors are merged, three times. In a fixed order.
+static inline void sum_eight(const Floats *v, float *out) {
+    typedef int32_t Lanes __attribute__((vector_size(32)));
+    Eight a[4], b[2];
+    for (int i = 0; i < 4; i++) {
+        Eight l = halved(v[2 * i]), r = halved(v[2 * i + 1]);
+        a[i] = __builtin_shuffle(l, r, Lanes{0, 8, 2, 10, 4, 12, 6, 14}) + __builtin_shuffle(l, r, Lanes{1, 9, 3, 11, 5, 13, 7, 15});
+    }
+    for (int i = 0; i < 2; i++) {
+        Eight l = a[2 * i], r = a[2 * i + 1];
+        b[i] = __builtin_shuffle(l, r, Lanes{0, 1, 8, 9, 4, 5, 12, 13}) + __builtin_shuffle(l, r, Lanes{2, 3, 10, 11, 6, 7, 14, 15});
+    }
+    Eight all = __builtin_shuffle(b[0], b[1], Lanes{0, 1, 2, 3, 8, 9, 10, 11}) + __builtin_shuffle(b[0], b[1], Lanes{4, 5, 6, 7, 12, 13, 14, 15});
+    memcpy(out, &all, sizeof all);
 }
 
 // 2^x for |x| < 120, relative error 2e-7: round by adding 1.5 * 2^23, a degree-5 polynomial on [-1/2, 1/2], then add the

@@ -187,7 +187,7 @@ def _surface(count: int, rng: np.random.Generator) -> tuple[Array, Array]:
     parts = [_on_capsule(*capsule, n, rng) for capsule, n in zip(capsules, drawn, strict=True)]
     points, normals = (np.concatenate(part) for part in zip(*parts, strict=True))
     inside = [_to_segment(points, a, b) < 0.985 * radius for a, b, radius in capsules]
-    outer = rng.permutation(np.flatnonzero(~np.any(inside, axis=0)))[:count]
+    outer = np.sort(rng.permutation(np.flatnonzero(~np.any(inside, axis=0)))[:count])  # by limb, as bodies' vertices are
     return points[outer], normals[outer]
 
 
@@ -197,7 +197,7 @@ def _on_capsule(a: Array, b: Array, radius: float, count: int, rng: np.random.Ge
     axis = (b - a) / length
     side = np.cross(axis, [0.3, 0.5, 0.8])
     side /= np.linalg.norm(side)
-    height, turn = rng.uniform(-radius, length + radius, count), rng.uniform(0, 2 * np.pi, count)
+    height, turn = np.sort(rng.uniform(-radius, length + radius, count)), rng.uniform(0, 2 * np.pi, count)
     on_axis = np.clip(height, 0, length)
     beyond = (height - on_axis) / radius
     around = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * np.cross(axis, side)
