@@ -26,6 +26,7 @@ from rich.table import Table
 
 from services.errors import ServiceError
 from services.settings import Settings
+from services.store.tokens import first_token_file
 from services.up import Stack, raise_interrupt, running
 
 METHODS = ("gauhuman", "mad-avatar", "rs-avatar")
@@ -159,11 +160,17 @@ def text_of(value: str | float | None) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
+def proof(settings: Settings) -> dict[str, str]:
+    """The header that lets us in, where one is asked for."""
+    file = first_token_file(settings.home)
+    return {"authorization": f"Bearer {file.read_text('utf-8').strip()}"} if settings.needs_token else {}
+
+
 def demonstrate(options: argparse.Namespace, settings: Settings, console: Console) -> bool:
     """Run the jobs and print the table; whether all succeeded."""
     with (
         running(settings, console.print) as stack,
-        httpx.Client(base_url=settings.url, timeout=30.0, trust_env=False) as client,
+        httpx.Client(base_url=settings.url, timeout=30.0, trust_env=False, headers=proof(settings)) as client,
     ):
         console.print(f"service ready at {settings.url}, home {settings.home}", highlight=False)
         jobs = {submit(client, options, method): method for method in options.methods}

@@ -25,7 +25,7 @@ from services import redis_server
 from services.errors import ServiceError, SettingsError
 from services.process import stop, terminate_with_parent
 from services.settings import ROOT, Settings, make_home, read_settings
-from services.store import schema
+from services.store import schema, tokens
 from services.store.session import Store
 
 READY_SECONDS = 60.0
@@ -82,7 +82,6 @@ class Stack:
         Raises:
             ServiceError: if something cannot start; what was started is stopped again by ``stop``.
         """
-        self.settings.require_safe_bind()
         make_home(self.settings)
         self._lock = lock_home(self.settings)
         require_free_port(self.settings)
@@ -93,6 +92,8 @@ class Stack:
         if self.settings.embedded_database:
             schema.migrate(store)
         schema.require_head(store)
+        if self.settings.needs_token and (path := tokens.issue_first(store, self.settings.home)):
+            self._say(f"first admin token, in {path}: {path.read_text('utf-8').strip()}")
         store.close()
         self._start("api", [sys.executable, "-m", "services.api"])
         self._start("worker", [sys.executable, "-m", "services.worker"])

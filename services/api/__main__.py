@@ -8,18 +8,32 @@ import uvicorn
 
 from services.api.app import create_app
 from services.errors import ServiceError
-from services.settings import make_home, read_settings
+from services.settings import Settings, make_home, read_settings
+from services.store import tokens
+from services.store.session import Store
 
 STREAMS_SECONDS = 2  # open event streams are cut after this; clients resume them
+
+
+def tell_first_token(settings: Settings) -> None:
+    """Where tokens are asked for and nobody has one yet: issue the first, and say once where it is."""
+    if not settings.needs_token:
+        return
+    store = Store(settings)
+    try:
+        if path := tokens.issue_first(store, settings.home):
+            print(f"first admin token, in {path}: {path.read_text('utf-8').strip()}", flush=True)
+    finally:
+        store.close()
 
 
 def main() -> int:
     """Serve until stopped."""
     try:
         settings = read_settings()
-        settings.require_safe_bind()
         make_home(settings)
         app = create_app(settings)
+        tell_first_token(settings)
     except ServiceError as error:
         print(error, file=sys.stderr)
         return 1

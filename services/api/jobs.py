@@ -9,11 +9,13 @@ from fastapi import APIRouter, Header, Query, Response
 from fastapi.responses import PlainTextResponse
 
 from services import jobs as wake_up
+from services.api.access import Who
 from services.api.deps import Back, JobId
 from services.api.requests import JobQuery, JobRequest, checked_key
 from services.api.views import ArtifactView, JobDetail, JobPage, JobView, ResultView
 from services.errors import NotFoundError, RequestError
 from services.store import artifacts, jobs, metrics, subjects
+from services.store.content import content_sha256
 from services.store.records import Filters, Job, State, Submission
 from services.store.session import Store
 
@@ -29,26 +31,35 @@ VERBS: dict[str, Callable[[Store, str], Job]] = {
 router = APIRouter(prefix="/jobs", tags=["jobs"])
 
 
-@router.post("", status_code=202, responses={200: {"model": JobDetail, "description": "the key's earlier job"}})
+KNOWN = {"model": JobDetail, "description": "the key's earlier job, or a known result"}
+
+
+@router.post("", status_code=202, responses={200: KNOWN})
 def submit(
     request: JobRequest,
     response: Response,
     back: Back,
+    who: Who,
+    force: Annotated[bool, Query(description="run it even if a job of the same spec, data and code has")] = False,
     idempotency_key: Annotated[str | None, Header(description="repeat it to repeat a request safely")] = None,
 ) -> JobDetail:
-    """Accept a job: 202 and its place. A repeated Idempotency-Key gives the first job back, 200."""
+    """Accept a job: 202 and its place. A repeated Idempotency-Key gives the first job back, 200; so does a result
+    that is known: the new job has ended with it, and ``reused_from`` says whose it is.
+    """
     key = checked_key(idempotency_key)
     spec = request.resolve()
     try:
-        subjects.get(back.store, spec.subject)
+        subject = subjects.get(back.store, spec.subject)
     except NotFoundError as error:
         raise RequestError(error.name, error.expected, error.got) from None
     stored = spec.model_dump(mode="json", by_alias=True)
+    content = content_sha256(back.store, spec, subject)
+    about = {"owner": who.owner, "content_sha256": content, "forced": force}
     limits = back.settings.max_attempts
-    job, is_new = jobs.submit(back.store, Submission(stored, spec.sha256(), request.sha256(), limits, key))
-    if is_new:
+    job, is_new = jobs.submit(back.store, Submission(stored, spec.sha256(), request.sha256(), limits, key, **about))
+    if is_new and job.state == State.QUEUED:
         wake_up.enqueue(back.broker, job.id)
-    response.status_code = 202 if is_new else 200
+    response.status_code = 202 if is_new and job.state == State.QUEUED else 200
     response.headers["location"] = f"/api/v1/jobs/{job.id}"
     return JobDetail.of(job)
 
@@ -70,8 +81,9 @@ def get_job(job_id: JobId, back: Back) -> JobDetail:
 
 
 @router.post("/{job_id}/{verb}", status_code=202)
-def steer(job_id: JobId, verb: Verb, back: Back) -> JobDetail:
-    """Cancel, pause, resume or retry. A running job is asked, and leaves a checkpoint before it stops."""
+def steer(job_id: JobId, verb: Verb, back: Back, who: Who) -> JobDetail:
+    """Cancel, pause, resume or retry a job of one's own. A running one is asked, and leaves a checkpoint."""
+    who.require_owner("job", jobs.get(back.store, job_id).owner)
     job = VERBS[verb](back.store, job_id)
     if job.state == State.QUEUED:
         wake_up.enqueue(back.broker, job.id)

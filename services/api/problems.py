@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from http import HTTPStatus
 
 from fastapi import FastAPI, Request, Response
@@ -14,11 +14,17 @@ from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 
 from rsavatar.errors import SpecError
-from services.errors import ConflictError, NotFoundError, RequestError, ServiceError
+from services.errors import ConflictError, ForbiddenError, NotFoundError, QuotaError, RequestError, ServiceError
 
 MEDIA_TYPE = "application/problem+json"
 LONGEST_ECHO = 200  # characters of a refused value that are sent back
-STATUS: dict[type[ServiceError], int] = {NotFoundError: 404, ConflictError: 409, RequestError: 422}
+STATUS: dict[type[ServiceError], int] = {
+    ForbiddenError: 403,
+    NotFoundError: 404,
+    ConflictError: 409,
+    RequestError: 422,
+    QuotaError: 429,
+}
 SENTENCE = re.compile(r"^(?P<name>[^:]{1,80}): expected (?P<expected>.+), got (?P<got>.+)$", re.DOTALL)
 
 log = logging.getLogger(__name__)
@@ -42,10 +48,12 @@ class Problem(BaseModel):
     errors: list[Fault] = []
 
 
-def problem(status: int, detail: str, faults: Sequence[Fault] = ()) -> JSONResponse:
+def problem(
+    status: int, detail: str, faults: Sequence[Fault] = (), headers: Mapping[str, str] | None = None
+) -> JSONResponse:
     """A response that carries a problem document."""
     body = Problem(title=HTTPStatus(status).phrase, status=status, detail=detail, errors=list(faults))
-    return JSONResponse(body.model_dump(), status, media_type=MEDIA_TYPE)
+    return JSONResponse(body.model_dump(), status, headers, media_type=MEDIA_TYPE)
 
 
 def from_sentences(text: str) -> list[Fault]:
@@ -80,9 +88,7 @@ async def _validation(request: Request, error: Exception) -> Response:
 
 async def _http(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
-    response = problem(error.status_code, str(error.detail))
-    response.headers.update(error.headers or {})
-    return response
+    return problem(error.status_code, str(error.detail), headers=error.headers)
 
 
 async def _unexpected(request: Request, error: Exception) -> Response:

@@ -29,7 +29,7 @@ def list_subjects(back: Back) -> list[SubjectView]:
 @router.post("", status_code=201, responses={200: {"model": SubjectView, "description": "known already"}})
 def register(body: SubjectRequest, request: Request, response: Response, back: Back) -> SubjectView:
     """Register a directory under an allowed root; on this machine, an operator may name any directory."""
-    is_operator = request.client is not None and request.client.host in LOOPBACK and not back.settings.allow_remote
+    is_operator = request.client is not None and request.client.host in LOOPBACK and not back.settings.needs_token
     path = allowed_path(back.settings, body.path, is_operator=is_operator)
     kind, info = inspect(path)
     subject, is_new = subjects.add(back.store, Subject(body.name, str(path), kind, info))

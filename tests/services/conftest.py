@@ -12,14 +12,16 @@ from pathlib import Path
 
 import httpx
 import pytest
+import redis
 import uvicorn
+from fastapi import FastAPI
 from sqlalchemy import text
 
 from services import redis_server
 from services.api.app import create_app
 from services.process import stop
 from services.settings import Settings, make_home
-from services.store import jobs, schema
+from services.store import jobs, schema, tokens
 from services.store.records import Job, Submission
 from services.store.session import Store
 
@@ -78,10 +80,10 @@ def store(settings: Settings, migrated: Path, empty: Store) -> Store:
 
 
 @contextmanager
-def serving(settings: Settings) -> Iterator[httpx.Client]:
+def serving(settings: Settings, app: FastAPI | None = None) -> Iterator[httpx.Client]:
     """The application behind a real socket, in a thread."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        config = uvicorn.Config(create_app(settings), log_level="error", timeout_graceful_shutdown=1)
+        config = uvicorn.Config(app or create_app(settings), log_level="error", timeout_graceful_shutdown=1)
         server = uvicorn.Server(config)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
@@ -100,6 +102,16 @@ def client(settings: Settings, store: Store) -> Iterator[httpx.Client]:
         yield client
 
 
+@pytest.fixture
+def closed(settings: Settings, store: Store) -> Iterator[httpx.Client]:
+    """A service that asks for tokens, and remembers nobody."""
+    with redis.Redis(unix_socket_path=settings.broker.removeprefix("redis+socket://").partition("?")[0]) as broker:
+        for key in broker.scan_iter("rsavatar:limit:*"):
+            broker.delete(key)
+    with serving(settings.model_copy(update={"require_token": True})) as client:
+        yield client
+
+
 @pytest.fixture(scope="session")
 def untouched(tmp_path_factory: pytest.TempPathFactory, broker: str) -> Iterator[httpx.Client]:
     """One application for all tests whose requests are refused or only look."""
@@ -111,6 +123,11 @@ def untouched(tmp_path_factory: pytest.TempPathFactory, broker: str) -> Iterator
     with serving(settings) as client:
         yield client
         assert client.get("/api/v1/jobs").json()["items"] == []
+
+
+def bearer(store: Store, *scopes: str, owner: str = "ann") -> dict[str, str]:
+    """The header of a fresh token."""
+    return {"authorization": f"Bearer {tokens.issue(store, 'test', owner, scopes)[1]}"}
 
 
 def submission(spec_sha256: str = "a" * 64, key: str | None = None, request: str = "r", **spec: object) -> Submission:

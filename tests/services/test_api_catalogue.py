@@ -10,7 +10,7 @@ import pytest
 from rsavatar.catalog import METHODS
 from services.settings import Settings
 from services.store.session import Store
-from tests.services.conftest import serving
+from tests.services.conftest import bearer, serving
 from tests.services.test_api_jobs import finish, post
 
 
@@ -60,8 +60,9 @@ def test_off_loopback_only_the_roots_count(settings: Settings, store: Store, sub
     outside.mkdir()
     (outside / "annots.npy").touch()
     (subject.parent / "link").symlink_to(outside)
-    remote = settings.model_copy(update={"allow_remote": True, "subject_roots": (subject.parent,)})
+    remote = settings.model_copy(update={"require_token": True, "subject_roots": (subject.parent,)})
     with serving(remote) as client:
+        client.headers.update(bearer(store, "admin"))
         for path in (outside, subject.parent / "link", subject.parent / ".." / "secret"):
             reply = client.post("/api/v1/subjects", json={"name": "x", "path": str(path)})
             assert reply.status_code == 422

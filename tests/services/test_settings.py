@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -26,11 +27,12 @@ def test_bad_value_names_its_variable(monkeypatch: pytest.MonkeyPatch) -> None:
         read_settings()
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.0.2", "::"])
-def test_other_machines_are_not_served_without_being_told(host: str) -> None:
-    with pytest.raises(SettingsError, match="RSAVATAR_ALLOW_REMOTE=1"):
-        Settings(host=host).require_safe_bind()
-    Settings(host=host, allow_remote=True).require_safe_bind()
+@pytest.mark.parametrize(
+    "changes", [{"host": "0.0.0.0"}, {"host": "::"}, {"allowed_hosts": ("lab",)}, {"require_token": True}]
+)
+def test_tokens_are_asked_for_wherever_others_could_come(changes: dict[str, Any]) -> None:
+    assert Settings(**changes).needs_token
+    assert not Settings().needs_token
 
 
 def test_socket_of_a_deep_home_is_short_enough_and_one_per_home() -> None:

@@ -1,0 +1,63 @@
+"""Browsers log in with a token and get a session: a cookie that scripts cannot read and other sites cannot use."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import anyio
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import HTMLResponse, RedirectResponse
+from fastapi.templating import Jinja2Templates
+
+from services.api.access import READ, Who, read_form
+from services.api.deps import Back
+from services.api.gate import COOKIE
+from services.store import tokens
+
+HOUR = 3600
+
+router = APIRouter(include_in_schema=False)
+templates = Jinja2Templates(Path(__file__).parent / "templates")
+
+
+def safe_next(target: str) -> str:
+    """A path of this site, whatever the address bar said."""
+    parts = urlsplit(target)
+    is_ours = target.startswith("/") and not target.startswith(("//", "/\\")) and not parts.netloc
+    return target if is_ours and target.isprintable() and "\\" not in target else "/"
+
+
+@router.get("/login", response_class=HTMLResponse)
+def show_login(request: Request) -> HTMLResponse:
+    """The page that asks for a token."""
+    context = {"next": safe_next(request.query_params.get("next", "/")), "wrong": False}
+    return templates.TemplateResponse(request, "login.html", context)
+
+
+@router.post("/login", response_class=HTMLResponse)
+async def log_in(request: Request, back: Back) -> Response:
+    """Open a session for a valid token, and go where the browser wanted to."""
+    form = await read_form(request)
+    target, secret = safe_next(form.get("next", "/")), form.get("token", "").strip()
+    token = await anyio.to_thread.run_sync(tokens.find, back.store, secret)
+    if token is None or token.name.startswith(tokens.SESSION):
+        context = {"next": target, "wrong": True}
+        return templates.TemplateResponse(request, "login.html", context, status_code=401)
+    seconds = back.settings.session_hours * HOUR
+    _, session = await anyio.to_thread.run_sync(tokens.open_session, back.store, token, seconds)
+    reply = RedirectResponse(target, 303)
+    reply.set_cookie(
+        COOKIE, session, int(seconds), httponly=True, samesite="strict", secure=request.url.scheme == "https"
+    )
+    return reply
+
+
+@router.post("/logout", response_class=RedirectResponse, dependencies=[READ])
+def log_out(who: Who, back: Back) -> Response:
+    """End the session at once."""
+    if who.csrf is not None and who.token_id is not None:
+        tokens.revoke(back.store, who.token_id)
+    reply = RedirectResponse("/login", 303)
+    reply.delete_cookie(COOKIE, httponly=True, samesite="strict")
+    return reply
