@@ -62,13 +62,16 @@ def softmax_splat(image: Tensor, flow: Tensor, metric: Tensor | None = None) -> 
         raise DataError(expected("splatting metric", tuple(flow[:, :1].shape), tuple(metric.shape)))
     # A common factor of all weights cancels; without it exp(metric) may overflow.
     weight = (metric - metric.detach().amax((1, 2, 3), keepdim=True)).clamp(min=-60).exp()
-    thrown = _splat(torch.cat([image * weight, weight, torch.ones_like(weight)], 1), flow)
+    thrown = splat(torch.cat([image * weight, weight, torch.ones_like(weight)], 1), flow)
     total = thrown[:, -2:-1]
     return thrown[:, :-2] / torch.where(total > 0, total, torch.ones_like(total)), thrown[:, -1:]
 
 
-def _splat(values: Tensor, flow: Tensor) -> Tensor:
-    """Sums [B, C, H, W] of values times bilinear shares at their places; what falls outside is lost."""
+def splat(values: Tensor, flow: Tensor) -> Tensor:
+    """Throws every pixel p to p + flow(p) and adds up there: values [B, C, H, W] times their bilinear shares.
+
+    What falls outside is lost. ``flow`` is [B, 2, H, W], pixels. Differentiable in both.
+    """
     batch, channels, height, width = values.shape
     place = _places(flow) + flow
     corner = place.detach().floor()
