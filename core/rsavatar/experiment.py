@@ -16,10 +16,10 @@ import torch
 from rsavatar import __version__, catalog, kernels
 from rsavatar.body.find import find_body
 from rsavatar.calibration import found_schedule, schedule_errors
-from rsavatar.checkpoint import Owner, read_own
+from rsavatar.checkpoint import Owner, settle
 from rsavatar.data.catalogue import open_subject
 from rsavatar.data.disturb import disturb
-from rsavatar.errors import CheckpointError, SpecError, expected
+from rsavatar.errors import SpecError, expected
 from rsavatar.evaluate import Score, evaluate, write_preview
 from rsavatar.events import Note, Preview, Report, silent
 from rsavatar.methods.base import AbstractMethod, Case, build_actor, check_case, observations, settings
@@ -87,6 +87,7 @@ def run(
         DataError, BodyError, SpecError, CheckpointError, KernelError, DivergedError: as their names say.
         Interrupted: when ``should_stop`` asked for it.
     """
+    kernels.keep_memory()
     _use_threads()
     out = out.resolve()
     out.mkdir(parents=True, exist_ok=True)
@@ -141,16 +142,10 @@ def _use_threads() -> None:
 
 
 def _checkpoint_file(out: Path, owner: Owner, report: Report) -> Path:
-    """Where the checkpoint is or will be. One that belongs to another job is set aside, not overwritten."""
+    """Where the checkpoint is or will be. One that is damaged or another job's is set aside, not overwritten."""
     path = out / "checkpoint.safetensors"
-    if path.exists():
-        try:
-            _, step = read_own(path, owner)
-            report(Note(f"Resuming from step {step}."))
-        except CheckpointError as error:
-            aside = path.with_suffix(".other.safetensors")
-            path.replace(aside)
-            report(Note(f"Starting anew, old checkpoint kept as {aside.name}: {error}"))
+    for sentence in settle(path, owner)[1]:
+        report(Note(sentence))
     return path
 
 
