@@ -102,5 +102,18 @@ RS_API void rs_pose_backward(const RsBody *body, int states, const float *grad_t
                              float *grad_residuals, float *grad_root_rotation, float *grad_root_translation,
                              float *grad_rest_joints);
 
+// One step of Adam on `count` parameters; `step` counts from 1 with the step that is to be taken.
+//   value, mean, square, gradient [size]; a null value: the gradient is checked only
+struct RsParameter {
+    int64_t size;
+    float *value, *mean, *square;
+    const float *gradient;
+    float rate;
+    int32_t step;
+};
+
+// 0 on success, 1 out of memory, 3 if a gradient is NaN or infinite: then nothing has changed.
+RS_API int rs_adam(const RsParameter *parameters, int count, float beta1, float beta2, float epsilon, int threads);
+
 RS_API int rs_lanes(void);  // SIMD lanes of this build, for reports
 }

@@ -12,7 +12,6 @@ import torch
 
 from rsavatar.errors import KernelError, expected
 
-
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h
 _LARGEST_KEPT, _MOST_KEPT = 32 << 20, 1 << 30  # bytes: a block, glibc's own maximum; and at the heap's end
 
@@ -90,6 +89,7 @@ def library() -> Any:
     lib.rs_l1.argtypes = [pointer] * 4 + [integer, integer, float_, float_, integer, pointer, pointer]
     lib.rs_pose.argtypes = [pointer, integer, pointer]
     lib.rs_pose_backward.argtypes = [pointer, integer, *[pointer] * 6]
+    lib.rs_adam.argtypes = [pointer, integer, float_, float_, float_, integer]
     lib.rs_pose.restype = lib.rs_pose_backward.restype = None
     return lib
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from rsavatar import checkpoint
+from rsavatar.adam import Adam
 from rsavatar.avatar.density import DensityRules, Edit, ScreenGradients
 from rsavatar.doubt import Doubt
 from rsavatar.errors import DivergedError, expected
@@ -59,6 +60,7 @@ class Settings:
     density: DensityRules | None
     rates: Rates = field(default_factory=Rates)
     sh_from: int = 1000  # step at which the colours' linear harmonics start
+    ssim_weight: float = 0.0
     doubt: bool = False
     doubt_from: float = 0.2  # part of the run after which images that contradict all others are left out
 
@@ -85,14 +87,14 @@ class SkinBlock:
         self._refined = actor.skin_weights()
         self.weights = self._refined.detach().requires_grad_(self._refined.requires_grad)
 
-    def close(self, optimizer: torch.optim.Optimizer) -> None:
+    def close(self, optimizer: Adam) -> None:
         """Hand the summed gradient to the network and take its step; non-finite sums are dropped."""
         gradient = self.weights.grad
         if gradient is None or not math.isfinite(float(gradient.sum())):
             return
         torch.autograd.backward(self._refined, gradient)
-        optimizer.step()
-        optimizer.zero_grad(set_to_none=True)
+        optimizer.advance()
+        optimizer.forget()
 
 
 class State:
@@ -117,9 +119,9 @@ class State:
             ("clock", list(actor.clock.parameters()) if actor.clock else [], rates.clock),
         ]
         adam = [{"name": name, "params": params, "lr": lr, "initial": lr} for name, params, lr in groups if params]
-        self.optimizer = torch.optim.Adam(adam, eps=1e-15, fused=True)
+        self.optimizer = Adam(adam, rates.motion, epsilon=1e-15)
         skin = list(actor.skin_offset.parameters()) if actor.skin_offset else [torch.nn.Parameter(torch.zeros(0))]
-        self.skin_optimizer = torch.optim.Adam(skin, lr=rates.skin_offset, fused=True)
+        self.skin_optimizer = Adam([{"params": skin}], rates.skin_offset)
         self.gradients = ScreenGradients(actor.avatar.count)
         self.doubt = Doubt(images)
         self.largest = rates.largest
@@ -137,8 +139,7 @@ class State:
         Raises:
             DivergedError: after ``MOST_REJECTED`` rejections in a row.
         """
-        if _finite(loss, screen, actor):
-            self.optimizer.step()
+        if math.isfinite(float(loss)) and self.optimizer.advance(_grad(screen)):
             actor.avatar.limit_scales(self.largest)
             self.gradients.add(_grad(screen), *size)
             self.rejected_in_a_row = 0
@@ -149,7 +150,7 @@ class State:
             if self.rejected_in_a_row >= MOST_REJECTED:
                 problem = expected("loss and gradients", "finite numbers", f"none in {MOST_REJECTED} steps in a row")
                 raise DivergedError(f"diverged at step {self.step}: {problem}")
-        self.optimizer.zero_grad(set_to_none=True)
+        self.optimizer.forget()
         self.step += 1
 
     def require_finite(self, actor: Actor) -> None:
@@ -204,13 +205,6 @@ class State:
 
 def _grad(tensor: Tensor) -> Tensor:
     return tensor.grad if tensor.grad is not None else torch.zeros_like(tensor)
-
-
-def _finite(loss: Tensor, screen: Tensor, actor: Actor) -> bool:
-    """Whether the loss is finite, and the gradients of what is drawn: all others come from these."""
-    watched = [screen, *actor.avatar.parameters(), actor.shapes, *actor.motion.parameters()]
-    watched += [] if actor.clock is None else list(actor.clock.parameters())
-    return math.isfinite(float(loss)) and all(math.isfinite(float(_grad(t).sum())) for t in watched)
 
 
 class Saver:

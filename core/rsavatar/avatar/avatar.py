@@ -37,6 +37,7 @@ class Avatar(torch.nn.Module):
         self.sh_constant = torch.nn.Parameter(torch.zeros(1, 3, count))
         self.sh_linear = torch.nn.Parameter(torch.zeros(3, 3, count))
         self.register_buffer("vertex", torch.arange(count))
+        self._gathered: tuple[Tensor | None, Tensor] = (None, torch.empty(0))
         self.register_buffer("prior", surface.weights.clone())  # [24, M] skinning weights of `vertex`
 
     @property
@@ -62,11 +63,16 @@ class Avatar(torch.nn.Module):
             shape_change: [10], shape coefficients minus the initial ones.
             pose_offset: [3, V] from ``Surface.pose_offsets``, or None.
         """
-        vertices = torch.tensordot(shape_change, self.surface.shape_directions, 1)
-        if pose_offset is not None:
-            vertices = vertices + pose_offset
-        shaped: Tensor = self.means + vertices.index_select(1, self.vertex)
-        return shaped
+        shaped: Tensor = self.means + torch.tensordot(shape_change, self._shape_directions(), 1)
+        return shaped if pose_offset is None else shaped + pose_offset.index_select(1, self.vertex)
+
+    def _shape_directions(self) -> Tensor:
+        """The surface's [10, 3, M] at each Gaussian, gathered once a binding: no step's backward pass scatters."""
+        vertex, directions = self._gathered
+        if vertex is not self.vertex:
+            vertex, directions = self.vertex, self.surface.shape_directions.index_select(2, self.vertex)
+            self._gathered = vertex, directions
+        return directions
 
     def gaussians(self, means: Tensor, skin_weights: Tensor, sh_degree: int) -> Gaussians:
         """The renderer's words for these Gaussians, with a fresh ``screen`` to catch screen-space gradients."""

@@ -43,6 +43,7 @@ class Plan:
 
 def main(json: Path | None) -> int:
     """Measure, print, and write the JSON file with its page and plots beside it."""
+    kernels.keep_memory()
     kernels.use_threads(len(os.sched_getaffinity(0)))
     torch.set_num_threads(1)
     result = measure(Plan())

@@ -131,6 +131,7 @@ def plot(result: TrainResult, path: Path) -> None:
 
 def main(json: Path | None) -> int:
     """Train, print, and write ``json`` and its plot."""
+    kernels.keep_memory()
     kernels.use_threads(len(os.sched_getaffinity(0)))
     torch.set_num_threads(1)
     folder = os.environ.get("RSAVATAR_BENCH_SUBJECT")
