@@ -8,6 +8,7 @@ that trains; so the settings that concern pools of processes have no place here.
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from typing import Any
 
 from celery import Celery
@@ -72,6 +73,18 @@ def enqueue(app: Celery, job_id: str) -> bool:
         app.send_task(TASK, kwargs={"job_id": job_id}, queue=QUEUE, retry=True, retry_policy=PUBLISH_POLICY)
     except BROKER_ERRORS as error:
         log.warning("wake-up of job %s not sent, the sweeper will: %s", job_id, error)
+        return False
+    return True
+
+
+def enqueue_many(app: Celery, job_ids: Sequence[str]) -> bool:
+    """Wake workers up for many jobs over one connection. False when the broker is away: the sweeper will send them."""
+    try:
+        with app.producer_pool.acquire(block=True) as producer:
+            for job_id in job_ids:
+                app.send_task(TASK, kwargs={"job_id": job_id}, queue=QUEUE, producer=producer, retry=False)
+    except BROKER_ERRORS as error:
+        log.warning("wake-ups of %d jobs not sent, the sweeper will: %s", len(job_ids), error)
         return False
     return True
 

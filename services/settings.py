@@ -27,6 +27,7 @@ class Settings(BaseSettings):
     home: Path = Field(default=Path("~/.local/share/rsavatar"), description="everything that is kept")
     database_url: str = Field(default="", description="SQLAlchemy URL; empty = SQLite in the home")
     broker_url: str = Field(default="", description="redis URL; empty = a private server on a unix socket in the home")
+    artifacts_url: str = Field(default="", description="file:///DIR or s3://BUCKET/PREFIX; empty = in the home")
     redis_server: Path | None = Field(default=None, description="binary of the private server; none = look for one")
     subject_roots: Annotated[tuple[Path, ...], NoDecode] = Field(
         default=(), description="folders that hold subjects: those found are registered"

@@ -14,7 +14,7 @@ from services.api.deps import Back, JobId
 from services.api.requests import JobQuery, JobRequest, checked_key
 from services.api.views import ArtifactView, JobDetail, JobPage, JobView, ResultView
 from services.errors import NotFoundError, RequestError
-from services.store import artifacts, jobs, metrics, subjects
+from services.store import artifacts, jobs, labels, listing, metrics, subjects
 from services.store.content import content_sha256
 from services.store.records import Filters, Job, State, Submission
 from services.store.session import Store
@@ -66,18 +66,21 @@ def submit(
 
 @router.get("")
 def list_jobs(query: Annotated[JobQuery, Query()], back: Back) -> JobPage:
-    """Jobs, newest first."""
-    filters = Filters(query.state, query.method, query.subject, query.grid)
-    found = jobs.page(back.store, filters, query.cursor, query.limit + 1)
+    """Jobs, newest first unless sorted otherwise; ``q`` is explained by ``GET /filters``."""
+    filters = Filters(query.state, query.method, query.subject, query.grid, query.q)
+    order = listing.Order(query.sort.removeprefix("-"), query.sort.startswith("-"))
+    found = listing.page(back.store, filters, order, query.cursor, query.limit + 1)
     shown = found[: query.limit]
     is_last = len(found) <= query.limit
-    return JobPage(items=[JobView.of(job) for job in shown], next_cursor=None if is_last else shown[-1].id)
+    tags = labels.tags_of(back.store, [job.id for job in shown])
+    items = [JobView.of(job, tags.get(job.id, ())) for job in shown]
+    return JobPage(items=items, next_cursor=None if is_last else shown[-1].id)
 
 
 @router.get("/{job_id}")
 def get_job(job_id: JobId, back: Back) -> JobDetail:
     """One job with its complete spec."""
-    return JobDetail.of(jobs.get(back.store, job_id))
+    return JobDetail.of(jobs.get(back.store, job_id), labels.tags_of(back.store, [job_id]).get(job_id, ()))
 
 
 @router.post("/{job_id}/{verb}", status_code=202)
@@ -88,12 +91,6 @@ def steer(job_id: JobId, verb: Verb, back: Back, who: Who) -> JobDetail:
     if job.state == State.QUEUED:
         wake_up.enqueue(back.broker, job.id)
     return JobDetail.of(job)
-
-
-@router.get("/{job_id}/metrics")
-def get_metrics(job_id: JobId, back: Back) -> dict[str, list[tuple[int, float]]]:
-    """Training curves by name: [step, value] pairs, thinned evenly."""
-    return metrics.curves(back.store, job_id)
 
 
 @router.get("/{job_id}/results")

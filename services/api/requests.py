@@ -15,9 +15,12 @@ from pydantic_core import CoreSchema
 from rsavatar.spec import JobSpec, resolve
 from services.api.deps import UUID
 from services.errors import RequestError
+from services.store.listing import SORTS
+from services.store.query import LONGEST
 from services.store.records import State
 
 NAMES = ("method", "subject", "preset")
+SORT = f"^-?({'|'.join(SORTS)})$"
 SUBJECT_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"
 KEY = re.compile(r"[\x21-\x7e]{1,255}")
 
@@ -74,6 +77,8 @@ class JobQuery(BaseModel):
     method: str | None = Field(None, max_length=64)
     subject: str | None = Field(None, max_length=128)
     grid: str | None = Field(None, pattern=UUID)
+    q: str | None = Field(None, max_length=LONGEST, description="filter, such as: state:failed psnr>25 tag:paper")
+    sort: str = Field("-submitted", pattern=SORT, description="a key, with - for the largest first")
     cursor: str | None = Field(None, pattern=UUID, description="next_cursor of the page before")
     limit: int = Field(50, ge=1, le=200)
 

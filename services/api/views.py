@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
 from pydantic import BaseModel
 
 from services.store.records import TERMINAL, Artifact, Job, Outcome, State, Subject, fraction_of
+
+
+PLAIN = ("id", "state", "method", "subject", "priority", "grid_id", "owner", "reused_from")
+PLAIN += ("attempt", "failures", "max_attempts", "rss_bytes")
+DETAILS = ("spec_sha256", "content_sha256", "forced", "notes", "memory_limit_mb", "stall_seconds", "first_traceback")
 
 
 def instant(seconds: float | None) -> datetime | None:
@@ -48,9 +53,12 @@ class JobView(BaseModel):
     iterations: int | None
     priority: int
     grid_id: str | None
+    owner: str
+    reused_from: str | None
     attempt: int
     failures: int
     max_attempts: int
+    rss_bytes: int | None
     cancel_requested: bool
     pause_requested: bool
     progress: ProgressView
@@ -58,12 +66,12 @@ class JobView(BaseModel):
     created_at: datetime | None
     started_at: datetime | None
     finished_at: datetime | None
+    tags: list[str] = []
 
     @classmethod
     def fields_of(cls, job: Job) -> dict[str, Any]:
         """Values of the fields that lists and single jobs share."""
-        names = ("id", "state", "method", "subject", "priority", "grid_id", "attempt", "failures", "max_attempts")
-        return {name: getattr(job, name) for name in names} | {
+        return {name: getattr(job, name) for name in PLAIN} | {
             "terminal": job.state in TERMINAL,
             "preset": job.spec.get("preset"),
             "iterations": job.spec.get("iterations"),
@@ -77,9 +85,9 @@ class JobView(BaseModel):
         }
 
     @classmethod
-    def of(cls, job: Job) -> JobView:
+    def of(cls, job: Job, tags: Iterable[str] = ()) -> JobView:
         """The view of a job."""
-        return cls(**cls.fields_of(job))
+        return cls(tags=list(tags), **cls.fields_of(job))
 
 
 def progress_of(job: Job) -> ProgressView:
@@ -90,15 +98,22 @@ def progress_of(job: Job) -> ProgressView:
 
 
 class JobDetail(JobView):
-    """A job with its complete spec."""
+    """A job with its complete spec, and all that is known of its failures."""
 
     spec: dict[str, Any]
     spec_sha256: str
+    content_sha256: str | None
+    forced: bool
+    notes: str
+    memory_limit_mb: int | None
+    stall_seconds: float | None
+    first_traceback: str | None
 
     @classmethod
-    def of(cls, job: Job) -> JobDetail:
+    def of(cls, job: Job, tags: Iterable[str] = ()) -> JobDetail:
         """The view of a job."""
-        return cls(spec=dict(job.spec), spec_sha256=job.spec_sha256, **cls.fields_of(job))
+        details = {name: getattr(job, name) for name in DETAILS}
+        return cls(spec=dict(job.spec), tags=list(tags), **details, **cls.fields_of(job))
 
 
 class JobPage(BaseModel):
@@ -167,9 +182,11 @@ class SubjectView(BaseModel):
     path: str | None
     info: dict[str, Any]
     created_at: datetime | None
+    owner: str
+    state: str
+    size: int | None
 
     @classmethod
     def of(cls, subject: Subject) -> SubjectView:
         """The view of a subject."""
-        created = instant(subject.created_at or None)
-        return cls(name=subject.name, kind=subject.kind, path=subject.path, info=dict(subject.info), created_at=created)
+        return cls(**{**vars(subject), "info": dict(subject.info), "created_at": instant(subject.created_at or None)})

@@ -90,8 +90,8 @@ def to_grid(row: GridRow) -> Grid:
     return Grid(**{name: getattr(row, name) for name in names})
 
 
-def submit(store: Store, order: Order) -> tuple[Grid, list[str]]:
-    """Accept a grid and all its jobs in one transaction; the ids are of the jobs that wait, none if it was known.
+def submit(store: Store, order: Order) -> tuple[Grid, bool, list[str]]:
+    """Accept a grid and all its jobs in one transaction; whether it is new, and the ids of its jobs that wait.
 
     Raises:
         RequestError: if the idempotency key was used for another grid.
@@ -103,10 +103,10 @@ def submit(store: Store, order: Order) -> tuple[Grid, list[str]]:
         return _submit(store, order)
 
 
-def _submit(store: Store, order: Order) -> tuple[Grid, list[str]]:
+def _submit(store: Store, order: Order) -> tuple[Grid, bool, list[str]]:
     with store.write() as session:
         if (known := _known(session, order)) is not None:
-            return known, []
+            return known, False, []
         now = session.scalar(select(db_now())) or 0.0
         asked = order.request.model_dump(mode="json")
         parts = {name: asked[name] for name in ("name", "base", "axes", "includes", "excludes")}
@@ -119,7 +119,7 @@ def _submit(store: Store, order: Order) -> tuple[Grid, list[str]]:
         told = {"kind": state.kind, "payload": dict(state.payload), "created_at": now}
         session.execute(insert(EventRow), [{"job_id": row["id"], **told} for row in rows])
         ended = set(reuse.adopt_all(session, _known_results(session, rows)))
-        return grid, [row["id"] for row in rows if row["id"] not in ended]
+        return grid, True, [row["id"] for row in rows if row["id"] not in ended]
 
 
 def _known(session: Session, order: Order) -> Grid | None:
@@ -207,12 +207,14 @@ def count_states(store: Store, grid_ids: Sequence[str]) -> dict[str, dict[str, i
     return counts
 
 
-def finished(store: Store, hashes: Sequence[str]) -> dict[str, str]:
-    """Finished jobs by the hash of their specs, of those in ``hashes``; the newest of each."""
-    known = (JobRow.state == State.SUCCEEDED) & JobRow.spec_sha256.in_(hashes) & JobRow.reused_from.is_(None)
-    query = select(JobRow.spec_sha256, func.max(JobRow.id)).where(known).group_by(JobRow.spec_sha256)
+def finished(store: Store, contents: Mapping[str, str]) -> dict[str, str]:
+    """Jobs whose results would be reused, by the hash of the spec; ``contents`` are hashes with data and code."""
+    same = JobRow.content_sha256.in_(set(contents.values()))
+    known = same & (JobRow.state == State.SUCCEEDED) & JobRow.reused_from.is_(None)
+    query = select(JobRow.content_sha256, func.max(JobRow.id)).where(known).group_by(JobRow.content_sha256)
     with store.read() as session:
-        return {row[0]: row[1] for row in session.execute(query)}
+        found = {row[0]: row[1] for row in session.execute(query)}
+    return {spec: found[content] for spec, content in contents.items() if content in found}
 
 
 def jobs_of(store: Store, grid_id: str) -> list[GridJob]:

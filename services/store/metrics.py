@@ -10,12 +10,12 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
 from services.errors import ConflictError
+from services.store import curves as thinned
 from services.store.jobs import get, to_job
 from services.store.records import Claim, Outcome, Point, Score, State, TableEntry
 from services.store.session import Store, db_now
 from services.store.tables import JobRow, PointRow, ResultRow, ScoreRow
 
-CURVE_POINTS = 1000  # most points of one curve that leave the store
 DENORMALISED = ("psnr", "ssim", "flip", "lpips", "joint_mm", "sub_frame_joint_mm")
 
 
@@ -58,24 +58,12 @@ def put_outcome(session: Session, claim: Claim, outcome: Outcome) -> None:
 
 
 def curves(store: Store, job_id: str) -> dict[str, list[tuple[int, float]]]:
-    """Curves of a job by key, thinned evenly to at most ``CURVE_POINTS`` each; first and last points are kept.
+    """Curves of a job by key, thinned so that every spike stays (``services.store.curves``).
 
     Raises:
         NotFoundError: if there is no such job.
     """
-    get(store, job_id)
-    number = func.row_number().over(partition_by=PointRow.key, order_by=PointRow.step) - 1
-    total = func.count().over(partition_by=PointRow.key)
-    ranked = select(PointRow.key, PointRow.step, PointRow.value, number.label("n"), total.label("total"))
-    inner = ranked.where(PointRow.job_id == job_id).subquery()
-    stride = inner.c.total // CURVE_POINTS + 1
-    thin = (inner.c.n % stride == 0) | (inner.c.n == inner.c.total - 1)
-    query = select(inner.c.key, inner.c.step, inner.c.value).where(thin).order_by(inner.c.key, inner.c.step)
-    found: dict[str, list[tuple[int, float]]] = {}
-    with store.read() as session:
-        for key, step, value in session.execute(query):
-            found.setdefault(key, []).append((step, value))
-    return found
+    return thinned.of_jobs(store, [job_id])[job_id]
 
 
 def outcome_of(store: Store, job_id: str) -> Outcome:
@@ -90,7 +78,8 @@ def outcome_of(store: Store, job_id: str) -> Outcome:
         if row is None:
             raise ConflictError("state", "a succeeded job", get(store, job_id).state)
         order = (ScoreRow.camera, ScoreRow.frame, ScoreRow.metric)
-        rows = session.scalars(select(ScoreRow).where(ScoreRow.job_id == job_id).order_by(*order))
+        source = session.scalar(select(func.coalesce(JobRow.reused_from, JobRow.id)).where(JobRow.id == job_id))
+        rows = session.scalars(select(ScoreRow).where(ScoreRow.job_id == source).order_by(*order))
         scores = tuple(Score(s.camera, s.frame, s.metric, s.value) for s in rows)
         numbers = (row.gaussians, row.train_seconds, row.evaluate_seconds)
         return Outcome(row.means, row.per_camera, row.protocol, row.provenance, *numbers, scores)

@@ -8,6 +8,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from services.errors import FencedError
 from services.store import artifacts, events, jobs, leases, metrics
+from services.store import curves as thinned
 from services.store.records import Batch, Claim, Event, Failure, Look, Outcome, Point, Score, State
 from services.store.session import Store
 from tests.services.conftest import submit
@@ -146,7 +147,7 @@ def test_curves_are_thinned_and_keep_their_ends(store: Store) -> None:
     claim = take(store)
     leases.beat(store, claim, Batch(points=[Point("loss", n, 1.0 / n) for n in range(1, 5001)]), 60.0)
     curve = metrics.curves(store, job.id)["loss"]
-    assert len(curve) <= metrics.CURVE_POINTS + 1
+    assert len(curve) <= thinned.POINTS
     assert (curve[0], curve[-1]) == ((1, 1.0), (5000, 1.0 / 5000))
 
 
