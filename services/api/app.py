@@ -18,12 +18,14 @@ from services.api import (
     artifacts,
     audit,
     catalogue,
+    curves,
     events,
     figures,
     frames,
     grids,
     health,
     jobs,
+    labels,
     login,
     pages,
     problems,
@@ -31,6 +33,7 @@ from services.api import (
     subjects,
     tables,
     tokens,
+    uploads,
     vendor,
 )
 from services.api.access import BY_VERB, require_scopes
@@ -45,7 +48,7 @@ from services.store.session import Store
 
 PREFIX = "/api/v1"
 STATIC = Path(__file__).parent / "static"
-NOUNS = (jobs, frames, grids, events, artifacts, catalogue, subjects, tables, tokens, audit, render, figures)
+NOUNS = (jobs, labels, curves, frames, grids, events, artifacts, catalogue, subjects, tables, tokens, audit, render, figures)
 PROBLEM = {"model": problems.Problem, "content": {problems.MEDIA_TYPE: {}}, "description": "refused"}
 
 
@@ -58,6 +61,7 @@ def create_app(settings: Settings) -> FastAPI:
     store = Store(settings)
     schema.require_head(store)
     subjects.discover(store, settings.subject_roots)
+    uploads.remove_leftovers(settings, store)
 
     drawings = Drawings(settings)
 

@@ -1,22 +1,43 @@
-// Keeps a page fresh from one event stream. The page is complete without it.
-const api = "/api/v1";
-const link = document.getElementById("link");
-const detail = document.querySelector("[data-page=job]");
-const jobId = detail?.dataset.job;
+// Keeps a page fresh from one event stream: progress goes straight into its row, everything else asks the server for
+// the marked regions again. The page is complete without it.
+export const api = "/api/v1";
 const terminal = new Set(["cancelled", "failed", "dead", "succeeded"]);
 const verbs = {
   queued: ["cancel", "pause"], running: ["cancel", "pause"], paused: ["resume", "cancel"],
   failed: ["retry"], dead: ["retry"], cancelled: ["retry"], succeeded: [],
 };
-const curves = new Map();
-let reloading = 0;
+const pause = 1500; // between two refreshes, ms
+const thin = "\u202f";
+let refreshing = 0, refreshed = 0;
 
-function reloadSoon() { // once, however many events ask for it
-  clearTimeout(reloading);
-  reloading = setTimeout(() => location.reload(), 800);
+export const fixed = (value, digits) => (value === undefined || value === null ? null : Number(value).toFixed(digits));
+export const whole = (value) => String(Math.round(value)).replace(/\B(?=(\d{3})+$)/g, thin);
+
+export function duration(seconds) {
+  if (seconds < 60) return `${seconds < 10 ? seconds.toFixed(1) : Math.round(seconds)} s`;
+  if (seconds < 3600) return `${Math.floor(seconds / 60)} min ${Math.round(seconds % 60)} s`;
+  return `${Math.floor(seconds / 3600)} h ${Math.round((seconds % 3600) / 60)} min`;
 }
 
-const fixed = (value, digits) => (value === undefined || value === null ? null : Number(value).toFixed(digits));
+export function send(path, options = {}) {
+  const csrf = document.querySelector("meta[name=csrf]")?.content;
+  const headers = { ...(csrf ? { "X-CSRF-Token": csrf } : {}), ...options.headers };
+  return fetch(path, { method: "POST", ...options, headers });
+}
+
+export async function reasonOf(reply) {
+  try { return (await reply.json()).detail; } catch { return `${reply.status} ${reply.statusText}`; }
+}
+
+export function toast(text) {
+  const place = document.querySelector("[data-toast]");
+  if (!place) return;
+  place.textContent = text;
+  place.hidden = false;
+  setTimeout(() => { place.hidden = true; }, 6000);
+}
+
+export const tell = (name, detail) => document.dispatchEvent(new CustomEvent(name, { detail }));
 
 function put(place, field, text) {
   const node = place.querySelector(`[data-field=${field}]`);
@@ -25,126 +46,100 @@ function put(place, field, text) {
 
 function showState(place, state) {
   const node = place.querySelector("[data-field=state]");
+  if (!node) return;
   node.textContent = state;
   node.className = `state ${state}`;
-  if (state === "succeeded") place.querySelector("[data-field=bar]").value = 1;
+  place.dataset.state = state;
 }
 
 function showProgress(place, event) {
-  place.querySelector("[data-field=bar]").value = event.fraction;
-  put(place, "steps", `${event.stage} ${event.step}/${event.steps}`);
-  put(place, "eta", event.eta_seconds > 0 ? `${Math.ceil(event.eta_seconds)} s left` : "");
+  const bar = place.querySelector("[data-field=bar]");
+  if (bar) bar.value = event.fraction;
+  put(place, "steps", `${event.stage} ${whole(event.step)} / ${whole(event.steps)}`);
+  put(place, "eta", event.eta_seconds > 0 ? `${duration(event.eta_seconds)} left` : "");
   put(place, "loss", fixed(event.loss, 4));
   put(place, "psnr", fixed(event.psnr, 2));
-  put(place, "gaussians", event.gaussians);
+  if (event.gaussians) put(place, "gaussians", whole(event.gaussians));
 }
 
-function showVerbs(state) {
-  for (const button of document.querySelectorAll("[data-verb]")) {
-    button.hidden = !(verbs[state] ?? []).includes(button.dataset.verb);
+function swap(old, fresh) {
+  const open = [...old.querySelectorAll("details")].map((d) => d.open);
+  fresh.querySelectorAll("details").forEach((d, i) => { if (open[i]) d.open = true; });
+  const chosen = new Set([...old.querySelectorAll("input:checked")].map((i) => i.value));
+  fresh.querySelectorAll("input[type=checkbox]").forEach((i) => { i.checked = chosen.has(i.value); });
+  const held = old.contains(document.activeElement) ? document.activeElement : null;
+  const again = held && (held.getAttribute("href") ? `[href="${CSS.escape(held.getAttribute("href"))}"]` : held.value ? `[value="${CSS.escape(held.value)}"]` : null);
+  old.replaceWith(fresh);
+  if (again) fresh.querySelector(again)?.focus();
+}
+
+export async function refresh() { // regions are matched by name, so their number may change
+  refreshed = Date.now();
+  const reply = await fetch(location.href, { headers: { accept: "text/html" } });
+  if (!reply.ok) return;
+  const page = new DOMParser().parseFromString(await reply.text(), "text/html");
+  const missing = [...page.querySelectorAll("[data-fresh]")].some((n) => !document.querySelector(`[data-fresh="${n.dataset.fresh}"]`));
+  const state = page.querySelector("[data-page=job]")?.dataset.state;
+  if (missing || (state === "succeeded" && !document.querySelector("[data-heat]"))) { location.reload(); return; }
+  for (const old of document.querySelectorAll("[data-fresh]")) {
+    const fresh = page.querySelector(`[data-fresh="${old.dataset.fresh}"]`);
+    if (fresh && fresh.outerHTML !== old.outerHTML) swap(old, document.adoptNode(fresh));
   }
+  showVerbs();
+  tell("rs:fresh", {});
 }
 
-function draw(key) {
-  const points = curves.get(key);
-  if (points.length < 2) return;
-  let figure = document.querySelector(`[data-curve="${CSS.escape(key)}"]`);
-  if (!figure) {
-    figure = document.createElement("figure");
-    figure.dataset.curve = key;
-    figure.innerHTML = '<svg viewBox="0 0 640 160" preserveAspectRatio="none" role="img"><polyline/></svg><figcaption></figcaption>';
-    figure.querySelector("svg").setAttribute("aria-label", `${key} over training`);
-    document.getElementById("curves").append(figure);
+export function refreshSoon() {
+  clearTimeout(refreshing);
+  refreshing = setTimeout(refresh, Math.max(120, pause - (Date.now() - refreshed)));
+}
+
+function showVerbs() {
+  const job = document.querySelector("[data-page=job]");
+  for (const button of job?.querySelectorAll("[data-verb]") ?? []) {
+    button.hidden = !(verbs[job.dataset.state] ?? []).includes(button.dataset.verb);
   }
-  const values = points.map((p) => p[1]);
-  const low = Math.min(...values), high = Math.max(...values), first = points[0][0];
-  const span = points.at(-1)[0] - first || 1, scale = 152 / (high - low || 1);
-  const path = points.map(([s, v]) => `${((s - first) / span) * 640},${156 - (v - low) * scale}`).join(" ");
-  figure.querySelector("polyline").setAttribute("points", path);
-  figure.querySelector("figcaption").textContent = `${key}: ${Number(values.at(-1)).toPrecision(4)}`;
-}
-
-function addPoint(event) {
-  if (event.stage !== "train") return;
-  for (const key of ["loss", "psnr", "gaussians"]) {
-    if (event[key] === undefined) continue;
-    const points = curves.get(key) ?? [];
-    if (points.length && points.at(-1)[0] >= event.step) continue;
-    points.push([event.step, event[key]]);
-    curves.set(key, points);
-    draw(key);
-  }
-}
-
-function addNote(text) {
-  const item = document.createElement("li");
-  item.textContent = text;
-  document.getElementById("notes").append(item);
-}
-
-function addPicture(event) {
-  const url = `${api}/artifacts/${event.sha256}`;
-  if (document.querySelector(`#pictures a[href="${url}"]`)) return;
-  const figure = document.createElement("figure"), anchor = document.createElement("a");
-  const image = document.createElement("img"), caption = document.createElement("figcaption");
-  anchor.href = image.src = url;
-  image.alt = caption.textContent = `${event.caption}, step ${event.step}`;
-  anchor.append(image);
-  figure.append(anchor, caption);
-  document.getElementById("pictures").append(figure);
 }
 
 function take(message) {
   const event = JSON.parse(message.data);
-  const place = document.querySelector(`[data-job="${event.job_id}"]`);
-  if (!place) {
-    if (!detail && event.kind === "state" && event.state === "queued") reloadSoon();
-    return;
+  for (const place of document.querySelectorAll(`[data-job="${event.job_id}"]`)) {
+    if (event.kind === "progress") showProgress(place, event);
+    if (event.kind === "state") showState(place, event.state);
   }
-  if (event.kind === "progress") showProgress(place, event);
-  if (event.kind === "state") showState(place, event.state);
-  if (event.kind === "state" && event.means) put(place, "psnr", fixed(event.means.psnr, 2));
-  if (!detail) {
-    if (event.kind === "state" && event.state === "succeeded") reloadSoon();
-    return;
-  }
-  if (event.kind === "progress") addPoint(event);
-  if (event.kind === "note") addNote(event.text);
-  if (event.kind === "preview") addPicture(event);
-  if (event.kind === "checkpointed") addNote(`checkpoint at step ${event.step}`);
-  if (event.kind !== "state") return;
-  showVerbs(event.state);
-  if (event.reason) addNote(`${event.state}: ${event.reason.split("\n", 1)[0]}`);
-  if (terminal.has(event.state) && event.id > Number(document.body.dataset.newest)) reloadSoon();
+  tell("rs:event", event);
+  if (event.kind !== "progress") showVerbs();
+  const isNew = event.id > Number(document.body.dataset.newest);
+  if (isNew && event.kind === "state") refreshSoon();
 }
 
-function listen() {
-  const source = new EventSource(jobId ? `${api}/jobs/${jobId}/events` : `${api}/events?after=${document.body.dataset.newest}`);
-  source.onopen = () => { link.textContent = "live"; link.classList.add("on"); };
+function listen(jobId) {
+  const link = document.getElementById("link");
+  const say = (state, text) => { if (link) { link.dataset.link = state; link.textContent = text; } };
+  const after = document.body.dataset.newest;
+  const source = new EventSource(jobId ? `${api}/jobs/${jobId}/events?after=${after}` : `${api}/events?after=${after}`);
+  source.onopen = () => say("on", "live");
   source.onerror = () => {
-    link.classList.remove("on");
-    if (detail && terminal.has(detail.querySelector("[data-field=state]").textContent)) source.close();  // told all
-    link.textContent = source.readyState === EventSource.CLOSED ? "ended" : "reconnecting";
+    const ended = jobId && terminal.has(document.querySelector("[data-page=job]").dataset.state);
+    if (ended) source.close(); // everything has been told
+    say(ended ? "off" : "wait", ended ? "ended" : "reconnecting");
   };
   for (const kind of ["state", "progress", "note", "preview", "checkpointed"]) source.addEventListener(kind, take);
+  addEventListener("pagehide", () => source.close());
 }
 
-async function start() {
-  if (detail) {
-    showVerbs(detail.querySelector("[data-field=state]").textContent);
-    const found = await (await fetch(`${api}/jobs/${jobId}/metrics`)).json();
-    for (const [key, points] of Object.entries(found)) { curves.set(key, points); draw(key); }
-    for (const button of document.querySelectorAll("[data-verb]")) {
-      button.addEventListener("click", async () => {
-        button.disabled = true;
-        const reply = await fetch(`${api}/jobs/${jobId}/${button.dataset.verb}`, { method: "POST" });
-        if (!reply.ok) addNote((await reply.json()).detail);
-        button.disabled = false;
-        if (reply.ok) reloadSoon();
-      });
-    }
-  }
-  listen();
-}
+document.addEventListener("click", async (click) => {
+  const button = click.target.closest("[data-verb]");
+  if (!button) return;
+  button.disabled = true;
+  const id = button.closest("[data-job]").dataset.job;
+  const reply = await send(`${api}/jobs/${id}/${button.dataset.verb}`);
+  button.disabled = false;
+  if (reply.ok) refreshSoon(); else toast(await reasonOf(reply));
+});
 
-start();
+showVerbs();
+const job = document.querySelector("[data-page=job]");
+const over = job && terminal.has(job.dataset.state);
+if (over) { const link = document.getElementById("link"); if (link) link.textContent = "ended"; }
+if (!over && document.querySelector("[data-job],[data-fresh]")) listen(job?.dataset.job);

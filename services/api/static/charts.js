@@ -1,0 +1,24 @@
+// Plotly in our own colours and type.
+const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+export const colour = (method) => css(`--method-${method.replaceAll("+", "-")}`) || css("--accent");
+export const series = () => ["rs-avatar", "gauhuman", "mad-avatar", "cvr+gauhuman", "jamnet+gauhuman", "flow+gauhuman", "oracle"].map(colour);
+
+function axis(given) {
+  return { gridcolor: css("--rule"), zeroline: false, linecolor: css("--ink-3"), ticks: "outside", tickcolor: css("--ink-3"), ticklen: 4, automargin: true, ...given };
+}
+
+export function layout({ x, y, ...more }) {
+  return {
+    font: { family: css("--text"), size: 13, color: css("--ink-2") }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+    margin: { l: 60, r: 16, t: 12, b: 54 }, hovermode: "closest", legend: { orientation: "h", y: -0.24, x: 0 }, colorway: series(),
+    hoverlabel: { bgcolor: css("--surface"), bordercolor: css("--rule"), font: { color: css("--ink"), family: css("--text") } },
+    xaxis: axis(x), yaxis: axis(y), ...more,
+  };
+}
+
+export function draw(place, traces, how) {
+  if (!window.Plotly) { place.textContent = "The chart library could not be loaded."; return; }
+  window.Plotly.react(place, traces, layout(how), { displaylogo: false, responsive: true, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"], toImageButtonOptions: { format: "svg" } });
+}
+
+export const redraw = (again) => matchMedia("(prefers-color-scheme: dark)").addEventListener("change", again);
