@@ -11,7 +11,7 @@ from services.api.deps import Back, JobId
 from services.api.sources import source_of
 from services.store import jobs
 
-SHUTTER = r"^(global|blur|rolling|bands:[1-9][0-9]{0,3})$"
+SHUTTER = r"^(global|blur(:[1-9][0-9]?)?|rolling|bands:[1-9][0-9]{0,3})$"
 LARGEST, LARGEST_VIDEO = 1024, 768  # pixels of the longer side
 VIDEOS = {"mp4": "video/mp4", "webm": "video/webm", "gif": "image/gif"}
 IMAGES = {"png": "image/png", "webp": "image/webp"}
@@ -28,7 +28,7 @@ class Look(BaseModel):
 
     camera: str | None = Field(None, max_length=32, description="a calibrated camera of the subject")
     time: float = Field(0.0, ge=-0.5, le=1e6, description="output frames; 3.5 is half a frame after the third")
-    shutter: str = Field("global", pattern=SHUTTER, description="global, blur, rolling, or bands:T")
+    shutter: str = Field("global", pattern=SHUTTER, description="global, blur, blur:S, rolling, or bands:T")
     readout: float | None = Field(None, ge=0, le=1e4, description="source frames; none = the subject's own")
     azimuth: float = Field(0.0, ge=-360, le=360, description="degrees to the camera's right, around the body")
     elevation: float = Field(0.0, ge=-89, le=89, description="degrees upwards")

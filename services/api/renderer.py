@@ -96,6 +96,7 @@ class RenderProcess:
         threads = str(self._settings.threads)
         env = {key: value for key, value in os.environ.items() if key not in SECRETS}
         env |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RSAVATAR_THREADS"), threads)
+        env["MPLCONFIGDIR"] = str(self._settings.home / "run" / "matplotlib")  # its list of fonts; a home is writable
         words = (str(theirs.fileno()), str(self._settings.render_idle_seconds))
         command = [sys.executable, "-m", "services.renderer", *words]
         try:

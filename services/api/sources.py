@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from services.api.deps import Backend
-from services.errors import ConflictError
+from services.errors import ConflictError, NotFoundError
 from services.store import artifacts, jobs, subjects
 from services.store.records import Job
 
@@ -16,14 +16,14 @@ def source_of(back: Backend, job_id: str) -> dict[str, Any]:
     """Spec, checkpoint and subject of a job; of one that still trains, its newest checkpoint.
 
     Raises:
-        NotFoundError: if there is no such job.
+        NotFoundError: if there is no such job, or its checkpoint's bytes are gone.
         ConflictError: if it has no checkpoint yet.
     """
     job = jobs.get(back.store, job_id)
     kept = next((file for file in artifacts.of_job(back.store, job_id) if file.name == CHECKPOINT), None)
     path = back.settings.job_dir(job_id) / "checkpoint.safetensors"
     if kept is not None:
-        path = artifacts.path_of(back.store.artifacts_dir, kept.sha256)
+        _, path = artifacts.find(back.store, kept.sha256)
     if not path.is_file():
         raise ConflictError("state", "a job that has written a checkpoint", job.state)
     return {
@@ -38,6 +38,6 @@ def has_source(back: Backend, job: Job) -> bool:
     """Whether the job has an avatar to look at."""
     try:
         source_of(back, job.id)
-    except ConflictError:
+    except (ConflictError, NotFoundError):
         return False
     return True

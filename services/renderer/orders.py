@@ -88,11 +88,13 @@ class Desk:
     def _pictures(self, order: Mapping[str, Any]) -> Mapping[str, Any]:
         from rsavatar.export.strip import draw_pictures
 
-        sources = {job: self.replay(source) for job, source in order["sources"].items()}
-        return draw_pictures(sources, order["figure"]["pictures"])
+        replays: dict[str, Any] = {}
+        for job, source in order["sources"].items():
+            replays[job] = self.replay(source, next(reversed(replays.values()), None))
+        return draw_pictures(replays, order["figure"]["pictures"])
 
-    def replay(self, source: Mapping[str, Any]) -> Any:
-        """The job's avatar, opened once."""
+    def replay(self, source: Mapping[str, Any], known: Any = None) -> Any:
+        """The job's avatar, opened once; ``known`` may lend what they share."""
         from rsavatar.export.replay import Source, open_replay, prepare
 
         path = Path(source["checkpoint"])
@@ -103,7 +105,7 @@ class Desk:
         if key not in self._open:
             prepare(self._threads)
             folder = Path(source["subject_dir"]) if source["subject_dir"] else None
-            self._open[key] = open_replay(Source(JobSpec.model_validate(source["spec"]), path, folder))
+            self._open[key] = open_replay(Source(JobSpec.model_validate(source["spec"]), path, folder), known)
             while len(self._open) > KEPT:
                 self._open.popitem(last=False)
         self._open.move_to_end(key)

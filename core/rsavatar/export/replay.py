@@ -13,10 +13,12 @@ import torch
 from torch import Tensor
 
 from rsavatar import catalog, kernels
+from rsavatar.body.base import BodyModel
 from rsavatar.body.find import find_body
 from rsavatar.checkpoint import Owner, read
 from rsavatar.data.base import Array, Subject
 from rsavatar.data.catalogue import open_subject
+from rsavatar.data.disturb import disturb
 from rsavatar.errors import CheckpointError, SpecError, expected
 from rsavatar.geometry.rotations import exp_so3
 from rsavatar.imaging import Actor
@@ -35,6 +37,11 @@ class Source:
     checkpoint: Path
     subject_dir: Path | None
 
+    @property
+    def place(self) -> tuple[str, Path | None, str]:
+        """What subject and body are found by."""
+        return self.spec.subject, self.subject_dir, self.spec.body
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -50,11 +57,17 @@ class Stage:
 class Replay:
     """An avatar that can be looked at. Nothing here needs or keeps gradients."""
 
-    spec: JobSpec
+    source: Source
     subject: Subject
+    body: BodyModel
     actor: Actor
     skin_weights: Tensor  # [24, M], refined
     stage: Stage
+
+    @property
+    def spec(self) -> JobSpec:
+        """What the job was asked to do."""
+        return self.source.spec
 
     def place(self, time: float) -> tuple[int, float]:
         """The frame whose trajectory is asked, and the offset from its mid time in source frames.
@@ -75,23 +88,25 @@ def prepare(threads: int) -> None:
     torch.set_num_threads(1)
 
 
-def open_replay(source: Source) -> Replay:
-    """Load the subject and the checkpoint and put the actor together again.
+def open_replay(source: Source, known: Replay | None = None) -> Replay:
+    """Load the subject and the checkpoint and put the actor together again; ``known`` may lend its subject and body.
 
     Raises:
         DataError, BodyError: if the subject or the body cannot be read.
         CheckpointError: if the checkpoint is damaged, or was trained on other data than lies there now.
     """
-    subject = open_subject(source.spec.subject, source.subject_dir)
-    body, _ = find_body(source.spec.body, subject)
+    shares = known is not None and known.source.place == source.place
+    subject = known.subject if known and shares else open_subject(source.spec.subject, source.subject_dir)
+    body = known.body if known and shares else find_body(source.spec.body, subject)[0]
     tensors, owner, _ = read(source.checkpoint)
     _check_owner(owner, data=subject.fingerprint, body=body.sha256)
     method: AbstractMethod = catalog.load(catalog.METHODS, source.spec.method)()
     with torch.no_grad():
-        actor = build_actor(method, Case(source.spec, subject, body))
+        actor = build_actor(method, Case(source.spec, disturb(subject, source.spec.disturb, source.spec.seed), body))
         load_actor(actor, tensors)
         actor.requires_grad_(False)
-        return Replay(source.spec, subject, actor, actor.skin_weights().contiguous(), find_stage(actor, subject))
+        weights = actor.skin_weights().contiguous()
+        return Replay(source, subject, body, actor, weights, find_stage(actor, subject))
 
 
 def _check_owner(owner: Owner, **now: str) -> None:

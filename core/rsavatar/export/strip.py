@@ -15,12 +15,13 @@ from rsavatar.evaluate import unit
 from rsavatar.export.replay import Replay, joints_at
 from rsavatar.export.views import View, render_view
 from rsavatar.metrics.image import dilate, psnr
+from rsavatar.report.runs import OURS
 
 Floats = npt.NDArray[np.float32]
 AROUND = 0.05  # of the body's height: white around it
-ZOOMED = 0.24  # of the picture's width and height together: side of what is enlarged
-SHUTTER_SIZE = 720
-BANDS = 4
+ZOOMED = 0.3  # of the picture's width and height together: side of what is enlarged
+SHUTTER_SIZE = 640
+BANDS, SMOOTH_BLUR = 4, 32
 
 
 def draw_pictures(replays: Mapping[str, Replay], wanted: Mapping[str, Any]) -> dict[str, Any]:
@@ -49,15 +50,18 @@ def views(replays: Mapping[str, Replay], camera: str, frame: int) -> dict[str, A
         "truth": on_white(truth, mask)[cut],
         "input": _input(subject, camera, frame, (y1 - y0, x1 - x0)),
     }
-    disagreement = np.zeros(mask.shape, np.float32)
+    others, own = np.zeros(mask.shape, np.float32), np.zeros(mask.shape, np.float32)
     for job, replay in replays.items():
         black = render_view(replay, View(camera=camera, time=frame, size=size))
         error = np.abs(unit(black) - unit(truth)).mean(-1)
         found[job] = render_view(replay, View(camera=camera, time=frame, size=size, background="white"))[cut]
         found[f"error:{job}"] = error[cut]
         found[f"psnr:{job}"] = psnr(unit(black), unit(truth), dilate(mask > 0)) if mask.any() else float("nan")
-        disagreement = np.maximum(disagreement, error)
-    return {**found, "box": busiest(disagreement[cut])}
+        if replay.spec.method == OURS:
+            own = error
+        else:
+            others = np.maximum(others, error)
+    return {**found, "box": busiest(others[cut] - own[cut])}
 
 
 def _input(subject: Subject, camera: str, frame: int, shape: tuple[int, int]) -> Bytes:
@@ -78,7 +82,7 @@ def _input(subject: Subject, camera: str, frame: int, shape: tuple[int, int]) ->
 def exposures(replay: Replay, frame: int | None) -> dict[str, Any]:
     """The body under four shutters at the frame that moves most, or at ``frame``; ``box``, where they differ most."""
     fastest = max(range(replay.subject.frames), key=lambda n: _motion(replay, n)) if frame is None else frame
-    words = {"global": "global", "blur": "blur", "bands": f"bands:{BANDS}", "rolling": "rolling"}
+    words = {"global": "global", "blur": f"blur:{SMOOTH_BLUR}", "bands": f"bands:{BANDS}", "rolling": "rolling"}
     pictures = {
         name: render_view(replay, View(time=fastest, shutter=word, azimuth=25, size=SHUTTER_SIZE, background="white"))
         for name, word in words.items()

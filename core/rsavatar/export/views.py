@@ -23,7 +23,7 @@ Background = Literal["black", "white", "transparent"]
 Format = Literal["png", "webp"]
 DISTANCE = 5.0  # of the framing camera from the stage's centre, in reaches: a portrait lens, not a wide one
 MARGIN = 1.08  # of the framing camera's picture around the stage
-MOST_BLUR = 16  # instants that a blurred view averages
+MOST_BLUR, MOST_BANDS = 64, 8192
 
 
 @dataclass(frozen=True)
@@ -96,19 +96,24 @@ def readout_of(replay: Replay, view: View) -> float:
 
 
 def shutter_of(replay: Replay, word: str) -> AbstractShutter:
-    """global, blur (the mean over the readout), rolling (every row at its own instant), or bands:T.
+    """global, rolling (every row at its own instant), bands:T, or blur:S (the mean of S instants; blur alone: K).
 
     Raises:
         SpecError: if it is none of these.
     """
-    name, colon, bands = word.partition(":")
-    if name == "bands" and bands.isdecimal() and 1 <= int(bands) <= 8192:
-        return Bands(int(bands))
-    instants = min(max(round(replay.subject.timing.period_frames), 2), MOST_BLUR)
-    known: dict[str, AbstractShutter] = {"global": Instant(), "blur": Blur(instants), "rolling": Scanline()}
-    if name not in known or colon:
-        raise SpecError(expected("shutter", "global, blur, rolling, or bands:T", repr(word)))
-    return known[name]
+    name, colon, text = word.partition(":")
+    count = int(text) if text.isdecimal() else None
+    if name == "blur" and (count is None) == (not colon):
+        count = count or round(replay.subject.timing.period_frames)
+        if 1 <= count <= MOST_BLUR:
+            return Blur(count)
+    if name == "bands" and count is not None and 1 <= count <= MOST_BANDS:
+        return Bands(count)
+    known: dict[str, AbstractShutter] = {"global": Instant(), "rolling": Scanline()}
+    if word not in known:
+        wanted = f"global, blur, blur:S (S to {MOST_BLUR}), rolling, or bands:T (T to {MOST_BANDS})"
+        raise SpecError(expected("shutter", wanted, repr(word)))
+    return known[word]
 
 
 def camera_of(replay: Replay, view: View) -> tuple[Camera, float]:

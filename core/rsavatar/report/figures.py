@@ -13,6 +13,7 @@ from statistics import fmean
 from rsavatar.errors import SpecError, expected
 from rsavatar.report.palette import label_of
 from rsavatar.report.runs import (
+    OURS,
     Figure,
     Run,
     Wish,
@@ -28,7 +29,6 @@ from rsavatar.report.runs import (
 )
 from rsavatar.report.tables import LABELS, TOLD_THE_TRUTH
 
-OURS = "rs-avatar"
 VARIANTS: dict[str, str] = {  # ablation flags, in the order of the paper's table
     "": "full method",
     "no_rs": "without rolling shutter",
@@ -158,7 +158,7 @@ def _qualitative(runs: Sequence[Run], wish: Wish) -> Figure:
         raise SpecError(
             expected("subject", f"one with a finished job ({', '.join(subjects) or 'none'})", repr(wish.subject))
         )
-    subject = wish.subject or max(subjects, key=lambda s: (_extent(whole, s), s), default="")
+    subject = wish.subject or min(subjects, key=lambda s: (-_extent(whole, s), s), default="")
     own = {run.method: run for run in whole if run.subject == subject}  # the greatest seed of each method
     ordered = [
         own[m]
@@ -171,8 +171,8 @@ def _qualitative(runs: Sequence[Run], wish: Wish) -> Figure:
     pictures = {"kind": "strip", "subject": subject, "camera": camera, "frame": frame, "columns": columns}
     caption = (
         f"Novel views of {subject}, camera {camera}, frame {frame}: the rolling-shutter input of the nearest training "
-        "camera, the reconstructions at the mid-row instant, and the truth; enlarged where the methods differ most; "
-        "the error inside the body mask."
+        "camera, the reconstructions at the mid-row instant, and the truth; enlarged where ours gains most; "
+        "the error there, and PSNR inside the dilated body mask."
     )
     if None in (wish.camera, wish.frame):
         caption += " The view is the one of median gain over the shutter-oblivious baseline."

@@ -6,11 +6,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure as Paper
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
-from rsavatar.report.palette import INK, LINE, SOFT, label_of, look_of
+from rsavatar.report.palette import INK, SOFT, label_of, look_of
 from rsavatar.report.runs import OURS, Figure
 
 SINGLE, DOUBLE = 3.25, 6.875  # inches: one column, two
@@ -26,10 +27,10 @@ def mark(method: str, **more: Any) -> dict[str, Any]:
     return {"linestyle": "none", "markeredgewidth": 0.7, **known, **more}
 
 
-def legend(axes: Axes | Paper, methods: Sequence[str], **where: Any) -> None:
-    """A legend of methods, ours in bold."""
+def legend(axes: Paper, methods: Sequence[str], ncols: int) -> None:
+    """A legend of methods above the charts, ours in bold."""
     handles = [Line2D([], [], **mark(method), label=label_of(method)) for method in methods]
-    made = axes.legend(handles=handles, handletextpad=0.3, **where)
+    made = axes.legend(handles=handles, handletextpad=0.2, columnspacing=1.0, ncols=ncols, loc="outside upper center")
     for method, text in zip(methods, made.get_texts(), strict=True):
         text.set_fontweight("bold" if method == OURS else "normal")
 
@@ -37,7 +38,8 @@ def legend(axes: Axes | Paper, methods: Sequence[str], **where: Any) -> None:
 def per_subject(paper: Paper, figure: Figure, pictures: Data) -> None:
     """A row per subject, a mark per method, and the gain of ours."""
     rows = figure.data["rows"]
-    paper.set_size_inches(SINGLE, 0.75 + 0.34 * len(rows))
+    methods = list(dict.fromkeys(m["method"] for row in rows for m in row["methods"]))
+    paper.set_size_inches(SINGLE, 0.5 + 0.09 * len(methods) + 0.34 * len(rows))
     axes = paper.subplots()
     for y, row in enumerate(rows):
         at = {m["method"]: m for m in row["methods"]}
@@ -54,8 +56,7 @@ def per_subject(paper: Paper, figure: Figure, pictures: Data) -> None:
     axes.spines["left"].set_visible(False)
     axes.margins(x=0.08)
     axes.set_xlabel("held-out PSNR, dB")
-    methods = list(dict.fromkeys(m["method"] for row in rows for m in row["methods"]))
-    legend(paper, methods, loc="outside upper center", ncols=min(len(methods), 3), columnspacing=1.0)
+    legend(paper, methods, ncols=2)
 
 
 def _gain(axes: Axes, y: int, base: float, ours: float) -> None:
@@ -71,7 +72,11 @@ def pareto(paper: Paper, figure: Figure, pictures: Data) -> None:
     paper.set_size_inches(SINGLE, 2.5)
     axes = paper.subplots()
     for point in figure.data["points"]:
-        axes.plot(point["seconds"], point["psnr"], **mark(point["method"], markersize=3.2, alpha=0.45, zorder=2))
+        axes.plot(
+            point["seconds"],
+            point["psnr"],
+            **mark(point["method"], markersize=3.2, markeredgewidth=0, alpha=0.45, zorder=2),
+        )
     means = {m["method"]: m for m in figure.data["means"]}
     front = sorted((means[m]["seconds"], means[m]["psnr"]) for m in figure.data["front"])
     if len(front) > 1:
@@ -85,15 +90,19 @@ def pareto(paper: Paper, figure: Figure, pictures: Data) -> None:
     axes.margins(x=0.14, y=0.1)
     axes.set_xlabel("training, s")
     axes.set_ylabel("held-out PSNR, dB")
-    legend(paper, list(means), loc="outside upper center", ncols=min(len(means), 3), columnspacing=1.0)
+    legend(paper, list(means), ncols=2)
 
 
 def _log_ticks(axes: Axes, values: Sequence[float]) -> None:
     """Ticks at 1, 2, 5 of each decade, written out; half an octave of room at both ends."""
     axes.set_xlim(min(values) / 1.3, max(values) * 1.3)
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.xaxis.set_major_formatter("{x:g}")
+    _plain(axes.xaxis)
+
+
+def _plain(axis: Axis) -> None:
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
 
 
 CURVES = {"psnr": ("PSNR on the input, dB", "linear"), "loss": ("loss", "log")}
@@ -114,12 +123,14 @@ def curves(paper: Paper, figure: Figure, pictures: Data) -> None:
             axes.plot(series["steps"], series["mean"], marker=look.marker, markersize=size, markevery=every, **style)
         title, scale = CURVES[key]
         axes.set_yscale(scale)
+        if scale == "log":
+            _plain(axes.yaxis)
         axes.set_title(title, loc="left")
         axes.set_xlabel("step")
         axes.margins(x=0.01)
         axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
     methods = list(dict.fromkeys(s["method"] for s in figure.data["series"]))
-    legend(paper, methods, loc="outside upper center", ncols=len(methods), columnspacing=1.2)
+    legend(paper, methods, ncols=len(methods))
 
 
 MEASURES = {"psnr": "held-out PSNR, dB", "sub_frame_joint_mm": "joints within the readout, mm"}
@@ -159,31 +170,34 @@ def _difference(axes: Axes, x: float, y: int, change: float) -> None:
 
 def sweep(axes: Axes, data: Data) -> None:
     """PSNR against the number of bands, selecting and averaging; levels for scanlines and the oblivious baseline."""
-    finite = [s for s in data["sweep"] if str(s["bands"]).isdecimal()]
+    finite = [s for s in data["sweep"] if s["bands"] != "scanline"]
+    names = sorted({s["bands"] for s in finite}, key=band_order)
     for method in dict.fromkeys(s["method"] for s in finite):
-        own = sorted((int(s["bands"]), s["psnr"], s["psnr_std"] or 0.0) for s in finite if s["method"] == method)
-        bands, psnr, error = zip(*own, strict=True)
-        look = look_of(method)
-        axes.errorbar(bands, psnr, yerr=error, color=look.light, elinewidth=0.8, capsize=1.5, zorder=3)
-        axes.plot(bands, psnr, **mark(method, linestyle="none", zorder=4))
-    levels = [(s, "rows at their own instants") for s in data["sweep"] if s["bands"] == "scanline"]
-    levels += [(s, "one instant") for s in data["oblivious"]]
-    for summary, text in levels:
-        colour = look_of(summary["method"]).light
-        axes.axhline(summary["psnr"], color=colour, linewidth=1.0, linestyle=(0, (4, 2)), zorder=2)
-        place, words = (1.0, summary["psnr"]), f"{label_of(summary['method'])}: {text}"
-        axes.annotate(
-            words,
-            place,
-            (-2, 2),
-            xycoords=("axes fraction", "data"),
-            textcoords="offset points",
-            ha="right",
-            fontsize=6.5,
-            color=colour,
+        own = sorted(
+            (names.index(s["bands"]), s["psnr"], s["psnr_std"] or 0.0) for s in finite if s["method"] == method
         )
+        places, psnr, error = zip(*own, strict=True)
+        axes.errorbar(places, psnr, yerr=error, color=look_of(method).light, elinewidth=0.8, capsize=1.5, zorder=3)
+        axes.plot(places, psnr, **mark(method, zorder=4))
+        verb = "selecting" if method == OURS else "averaging"
+        _say(axes, (places[-1], psnr[-1]), f"{label_of(method)}, {verb}", method, (6, 0))
+    for summary in (*(s for s in data["sweep"] if s["bands"] == "scanline"), *data["oblivious"]):
+        method = summary["method"]
+        axes.axhline(summary["psnr"], color=look_of(method).light, linewidth=1.0, linestyle=(0, (4, 2)), zorder=2)
+        words = "every row its own instant" if method == OURS else "one instant"
+        _say(axes, (-0.3, summary["psnr"]), f"{label_of(method)}, {words}", method, (0, 4))
     axes.set_ylabel("held-out PSNR, dB")
-    axes.set_xlabel("T, row bands (selected) or instants (averaged)")
-    axes.spines["left"].set_color(LINE)
-    axes.margins(x=0.08, y=0.15)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xlabel("T, instants of the model")
+    axes.set_xticks(range(len(names)), names)
+    axes.set_xlim(-0.4, len(names) - 0.4 + 0.25 * len(names))
+    axes.margins(y=0.15)
+
+
+def band_order(bands: str) -> tuple[int, int]:
+    """Numbers first, then multiples of K."""
+    return (0, int(bands)) if bands.isdecimal() else (1, int(bands[:-1] or 1))
+
+
+def _say(axes: Axes, place: tuple[float, float], words: str, method: str, shift: tuple[int, int]) -> None:
+    colour, side = look_of(method).light, "center" if shift[0] else "baseline"
+    axes.annotate(words, place, shift, textcoords="offset points", fontsize=6.5, color=colour, va=side)

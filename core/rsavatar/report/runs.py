@@ -9,6 +9,7 @@ from typing import Any
 
 from rsavatar.report.tables import LABELS
 
+OURS = "rs-avatar"
 PRESETS = ("paper", "draft", "smoke")  # the one with the most careful runs first
 GRID = 60  # steps at which mean curves are drawn
 
