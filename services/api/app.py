@@ -48,7 +48,22 @@ from services.store.session import Store
 
 PREFIX = "/api/v1"
 STATIC = Path(__file__).parent / "static"
-NOUNS = (jobs, labels, curves, frames, grids, events, artifacts, catalogue, subjects, tables, tokens, audit, render, figures)
+NOUNS = (
+    jobs,
+    labels,
+    curves,
+    frames,
+    grids,
+    events,
+    artifacts,
+    catalogue,
+    subjects,
+    tables,
+    tokens,
+    audit,
+    render,
+    figures,
+)
 PROBLEM = {"model": problems.Problem, "content": {problems.MEDIA_TYPE: {}}, "description": "refused"}
 
 

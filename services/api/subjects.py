@@ -1,15 +1,21 @@
-"""Subjects: list them, register a directory."""
+"""Subjects: list them, register a directory, take an archive, forget one."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Request, Response
+import anyio
+from fastapi import APIRouter, Query, Request, Response
+from fastapi import Path as PathPart
+from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
 
-from services.api.deps import Back
-from services.api.requests import SubjectRequest
+from services.api import uploads
+from services.api.access import Who
+from services.api.deps import Back, Backend
+from services.api.recognise import inspect
+from services.api.requests import SUBJECT_NAME, SubjectRequest
 from services.api.views import SubjectView
 from services.errors import ConflictError, RequestError
 from services.settings import LOOPBACK, Settings
@@ -17,7 +23,25 @@ from services.store import subjects
 from services.store.records import Subject
 from services.store.session import Store
 
+ANSWERS: dict[int | str, dict[str, Any]] = {
+    200: {"model": SubjectView, "description": "known already"},
+    202: {"model": SubjectView, "description": "unpacked; a worker checks it"},
+}
+BINARY = {"schema": {"type": "string", "format": "binary"}}
+BODIES = {
+    "required": True,
+    "content": {
+        "application/json": {"schema": SubjectRequest.model_json_schema()},
+        "application/zip": BINARY,
+        "application/gzip": BINARY,
+    },
+}
+
 router = APIRouter(prefix="/subjects", tags=["subjects"])
+Name = Annotated[str, PathPart(max_length=128, pattern=SUBJECT_NAME, description="name of a subject")]
+UploadName = Annotated[
+    str | None, Query(max_length=128, pattern=SUBJECT_NAME, description="name of the subject in an archive")
+]
 
 
 @router.get("")
@@ -26,15 +50,58 @@ def list_subjects(back: Back) -> list[SubjectView]:
     return [SubjectView.of(subject) for subject in subjects.all_of(back.store)]
 
 
-@router.post("", status_code=201, responses={200: {"model": SubjectView, "description": "known already"}})
-def register(body: SubjectRequest, request: Request, response: Response, back: Back) -> SubjectView:
-    """Register a directory under an allowed root; on this machine, an operator may name any directory."""
-    is_operator = request.client is not None and request.client.host in LOOPBACK and not back.settings.needs_token
+@router.get("/{name}")
+def get_subject(name: Name, back: Back) -> SubjectView:
+    """One subject; ``info.report`` says what the check of an uploaded one has found."""
+    return SubjectView.of(subjects.look(back.store, name))
+
+
+@router.post("", status_code=201, responses=ANSWERS, openapi_extra={"requestBody": BODIES})
+async def create(request: Request, response: Response, back: Back, who: Who, name: UploadName = None) -> SubjectView:
+    """A directory under an allowed root (JSON), or an archive of one (zip, tar.gz; its name in the query).
+
+    On this machine an operator may name any directory. An archive is taken apart and answered with 202; a worker checks
+    it before jobs may name it.
+    """
+    if request.headers.get("content-type", "").partition(";")[0].strip().lower() == "application/json":
+        is_operator = not back.settings.needs_token and request.client is not None and request.client.host in LOOPBACK
+        body = parse(await request.body())
+        subject, is_new = await anyio.to_thread.run_sync(register, back, body, who.owner, is_operator)
+        response.status_code = 201 if is_new else 200
+    else:
+        if name is None:
+            raise RequestError("name", "the subject's name in the query", "none")
+        subject = await uploads.receive(request, name, who.owner, back.settings, back.store)
+        response.status_code = 202
+    response.headers["location"] = f"/api/v1/subjects/{subject.name}"
+    return SubjectView.of(subject)
+
+
+@router.delete("/{name}", status_code=204)
+def delete(name: Name, back: Back, who: Who) -> None:
+    """Forget a subject that no open job names. The files of an uploaded one are removed; a directory's stay."""
+    who.require_owner("subject", subjects.look(back.store, name).owner)
+    uploads.discard(subjects.remove(back.store, name), back.settings)
+
+
+def parse(body: bytes) -> SubjectRequest:
+    """The JSON that names a directory.
+
+    Raises:
+        RequestValidationError: saying what is wrong with it.
+    """
+    try:
+        return SubjectRequest.model_validate_json(body)
+    except ValidationError as error:
+        faults = [{**fault, "loc": ("body", *fault["loc"])} for fault in error.errors(include_url=False)]
+        raise RequestValidationError(faults) from None
+
+
+def register(back: Backend, body: SubjectRequest, owner: str, is_operator: bool) -> tuple[Subject, bool]:
+    """Make a directory known; the second value says whether it is new."""
     path = allowed_path(back.settings, body.path, is_operator=is_operator)
     kind, info = inspect(path)
-    subject, is_new = subjects.add(back.store, Subject(body.name, str(path), kind, info))
-    response.status_code = 201 if is_new else 200
-    return SubjectView.of(subject)
+    return subjects.add(back.store, Subject(body.name, str(path), kind, info, owner=owner))
 
 
 def allowed_path(settings: Settings, text: str, *, is_operator: bool) -> Path:
@@ -63,16 +130,3 @@ def discover(store: Store, roots: tuple[Path, ...]) -> None:
             subjects.add(store, Subject(body.name, body.path, kind, info))
         except (ValidationError, RequestError, ConflictError):
             continue  # not a subject, not a name, or another's name
-
-
-def inspect(path: Path) -> tuple[str, dict[str, Any]]:
-    """Layout of a subject by its names alone: what the files hold is checked when a job loads them.
-
-    Raises:
-        RequestError: if neither layout is there.
-    """
-    if (path / "rs" / "annots.npy").is_file():
-        return "rolling", {"truth": (path / "truth" / "motion.npz").is_file()}
-    if (path / "annots.npy").is_file():
-        return "zju", {}
-    raise RequestError("path", "a subject: rs/annots.npy (rolling shutter) or annots.npy (ZJU-MoCap-refine)", str(path))

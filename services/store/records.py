@@ -242,6 +242,15 @@ class TableEntry:
     gaussians: int
 
 
+class SubjectState(StrEnum):
+    """States of a subject; one that was uploaded is looked at before jobs may name it."""
+
+    UPLOADED = "uploaded"
+    CHECKING = "checking"
+    READY = "ready"
+    REFUSED = "refused"
+
+
 @dataclass(frozen=True)
 class Subject:
     """A registered subject; ``path`` is none for one that the core makes itself."""
@@ -251,3 +260,6 @@ class Subject:
     kind: str
     info: Mapping[str, Any] = field(default_factory=dict)
     created_at: float = 0.0
+    owner: str = "local"
+    state: str = "ready"
+    size: int | None = None

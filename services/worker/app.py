@@ -1,4 +1,4 @@
-"""The worker process: a Celery worker with a pool of threads, and the sweeper beside it."""
+"""The worker process: a Celery worker with a pool of threads; the sweeper and the examiner of subjects beside it."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from services.process import identity
 from services.settings import Settings
 from services.store import schema
 from services.store.session import Store
+from services.worker.checks import check_until
 from services.worker.sweep import sweep_until
 from services.worker.tasks import Crew, register
 
@@ -43,8 +44,11 @@ def serve(settings: Settings) -> None:
     app, crew = create_worker(settings)
     sweeper = threading.Thread(target=sweep_until, args=(crew.stopping, settings, crew.store, app, crew.owner))
 
+    examiner = threading.Thread(target=check_until, args=(crew.stopping, settings, crew.store))
+
     def start_sweeping(**_: Any) -> None:
         sweeper.start()
+        examiner.start()
 
     def stop_jobs(**_: Any) -> None:
         crew.stopping.set()
@@ -55,6 +59,7 @@ def serve(settings: Settings) -> None:
         app.worker_main(["worker", "--pool=threads", "--without-gossip", "--without-mingle", "--loglevel=INFO"])
     finally:
         crew.stopping.set()
-        if sweeper.ident is not None:
-            sweeper.join()
+        for thread in (sweeper, examiner):
+            if thread.ident is not None:
+                thread.join()
         crew.store.close()
