@@ -30,6 +30,15 @@ METRICS: dict[str, str] = {
     "lpips": "rsavatar.metrics.image:lpips",
 }
 
+STUDIES: dict[str, str] = {  # rsavatar bench NAME: many jobs, one table
+    "ablation": "rsavatar.bench.ablation",
+    "calibration": "rsavatar.bench.calibration",
+    "exposure": "rsavatar.bench.exposure",
+    "losses": "rsavatar.bench.losses",
+    "robustness": "rsavatar.bench.robustness",
+    "superres": "rsavatar.bench.superres",
+}
+
 DESCRIPTIONS: dict[str, str] = {
     "rs-avatar": "rolling-shutter model: every row rendered at its own instant (ours)",
     "gauhuman": "shutter-oblivious: one pose per frame, as if the frame were instantaneous",

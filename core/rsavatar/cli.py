@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from rsavatar import __version__
+from rsavatar.catalog import STUDIES
 from rsavatar.errors import RsAvatarError
 
 EXIT_BAD, EXIT_STOPPED = 2, 130  # a named error; interrupted from the keyboard
@@ -111,13 +112,19 @@ def _add_local(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     run.add_argument("--out", type=Path, metavar="DIR", help="where to write (default: runs/SUBJECT-METHOD-HASH)")
 
     bench = _add(verbs, "bench", "rsavatar.cli_local:bench", "measure speed or stability on this machine")
-    bench.add_argument("name", choices=["render", "growth", "train", "stability"])
+    bench.add_argument("name", choices=["render", "growth", "train", "stability", *STUDIES])
     bench.add_argument("--json", type=Path, metavar="FILE", help="write the figures here as well")
+    studies = bench.add_argument_group("of " + ", ".join(STUDIES), "many jobs; one that was cut goes on with --json")
+    studies.add_argument("--subjects", nargs="+", default=[], metavar="DIR", help="folders, studio-N, studio-N-exposed")
+    studies.add_argument("--preset", default="draft", help="default: draft")
+    studies.add_argument("--seeds", type=int, default=1, metavar="N", help="seeds 0 to N - 1 (default: 1)")
+    studies.add_argument("--jobs", type=int, default=1, metavar="N", help="processes at a time (default: 1)")
 
     nouns = verbs.add_parser("data", help="look at or make subjects").add_subparsers(required=True, metavar="VERB")
     check = _add(nouns, "check", "rsavatar.cli_local:check", "is a subject fit for training?", CHECK)
     check.add_argument("directory", type=Path, metavar="DIR")
     check.add_argument("--body", default="auto", help="auto, anny, or an SMPL-format .npz or .pkl (default: auto)")
+    check.add_argument("--json", action="store_true", help="the findings as one line of JSON")
     studio = _add(
         nouns, "studio", "rsavatar.cli_local:studio", "make the built-in subject, without any download", STUDIO
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import json
 import signal
 import threading
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
+from rsavatar.catalog import STUDIES
 from rsavatar.errors import DataError, Interrupted, SpecError, expected
 
 
@@ -42,6 +44,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def bench(arguments: argparse.Namespace) -> int:
     """``rsavatar bench``: one benchmark, by name."""
+    if arguments.name in STUDIES:
+        return _study(STUDIES[arguments.name], arguments)
     place = f"rsavatar.bench.{arguments.name}"
     try:
         module = importlib.import_module(place)
@@ -52,6 +56,17 @@ def bench(arguments: argparse.Namespace) -> int:
     return int(module.main(arguments.json) or 0)
 
 
+def _study(place: str, arguments: argparse.Namespace) -> int:
+    """``rsavatar bench ablation`` and its like."""
+    for name in ("seeds", "jobs"):
+        if getattr(arguments, name) < 1:
+            raise SpecError(expected(f"--{name}", "a whole number of at least 1", getattr(arguments, name)))
+    from rsavatar.bench.study import Request, main
+
+    words = (tuple(arguments.subjects), arguments.preset, arguments.seeds, arguments.jobs, arguments.json)
+    return main(place, Request(*words))
+
+
 def check(arguments: argparse.Namespace) -> int:
     """``rsavatar data check``: the findings, and status 1 where an error is among them."""
     if not arguments.directory.is_dir():
@@ -59,7 +74,10 @@ def check(arguments: argparse.Namespace) -> int:
     from rsavatar.data import check as checking
 
     report = checking.check(arguments.directory, arguments.body)
-    print(checking.render(report))
+    if arguments.json:
+        print(json.dumps({"ok": report.ok, "findings": [vars(finding) for finding in report.findings]}))
+    else:
+        print(checking.render(report))
     return 0 if report.ok else 1
 
 

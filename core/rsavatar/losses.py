@@ -1,4 +1,4 @@
-"""Losses on rendered images, fused with their gradients in native code."""
+"""Losses on rendered images: L1 fused with its gradient in native code, and structural dissimilarity in torch."""
 
 from __future__ import annotations
 
@@ -62,3 +62,37 @@ def l1(image: Rendering, target: Tensor, mask: Tensor, background: float, mask_w
     colour = target.to(image.rgb.dtype) / 255 + background * (1 - coverage)
     error = (image.over(background) - colour).abs().mean()
     return (error + mask_weight * (1 - image.transmittance - coverage).abs().mean()).double()
+
+
+WINDOW, DEVIATION = 11, 1.5  # pixels: GauHuman's, and Wang et al.'s
+
+
+def dissimilarity(image: Rendering, target: Tensor) -> Tensor:
+    """1 - SSIM (Wang et al., 2004) of images on black: Gaussian window, constants for a range of 1, whole windows only.
+
+    Args:
+        image: [3, H, W], at least ``WINDOW`` pixels wide and high.
+        target: [3, H, W] uint8.
+
+    Returns:
+        A float64 scalar in [0, 2], differentiable in ``image``; 0 for images that hold no whole window.
+    """
+    if min(target.shape[1:]) < WINDOW:
+        return (0.0 * image.rgb.sum()).double()
+    x, y = image.rgb, target.to(image.rgb.dtype) / 255
+    mean_x, mean_y, xx, yy, xy = _windowed(torch.stack([x, y, x * x, y * y, x * y]))
+    var_x, var_y, both = xx - mean_x * mean_x, yy - mean_y * mean_y, xy - mean_x * mean_y
+    c1, c2 = 0.01**2, 0.03**2
+    likeness = (2 * mean_x * mean_y + c1) * (2 * both + c2)
+    norm = (mean_x * mean_x + mean_y * mean_y + c1) * (var_x + var_y + c2)
+    return (1 - (likeness / norm).mean()).double()
+
+
+def _windowed(images: Tensor) -> Tensor:
+    """Gaussian-weighted means [N, 3, H - 10, W - 10] of images [N, 3, H, W], first along rows, then along columns."""
+    places = torch.arange(WINDOW, dtype=images.dtype) - WINDOW // 2
+    weights = torch.softmax(-places * places / (2 * DEVIATION**2), 0)
+    flat = images.flatten(0, 1)[:, None]
+    along = torch.nn.functional.conv2d(flat, weights[None, None, None, :])
+    both: Tensor = torch.nn.functional.conv2d(along, weights[None, None, :, None])
+    return both.reshape(*images.shape[:2], *both.shape[-2:])

@@ -26,20 +26,24 @@ def disturb(subject: Subject, how: Disturbance, seed: int) -> Subject:
     """``subject`` as a method gets to see it.
 
     Raises:
-        DataError: if the fit's error is to be scaled and the subject has no true motion.
+        DataError: if the fit's error is to be scaled and the subject has no true motion. Sharp frames that do not
+            exist are missed when they are read.
     """
     if not how.any():
         return subject
     rng = np.random.default_rng([seed, 19])
     views = [(camera, frame) for camera in subject.training for frame in range(subject.frames)]
+    observe, timing = subject.observe, subject.timing
+    if how.capture == "global shutter":
+        observe, timing = subject.truth, replace(timing, readout_frames=0.0, exposure_frames=0.0)
     absent, wrong = _chosen(views, how.missing, rng), _chosen(views, how.masks, rng)
     return replace(
         subject,
-        timing=mistimed(subject.timing, subject.training, how),
+        timing=mistimed(timing, subject.training, how),
         fit=subject.fit if how.fit == 1 else _worse_fit(subject, how.fit),
         missing=subject.missing | absent,
         fingerprint=sha256(f"{subject.fingerprint} {how.model_dump_json()} {seed}".encode()).hexdigest(),
-        observe=_with_wrong_masks(subject, wrong) if wrong else subject.observe,
+        observe=_with_wrong_masks(replace(subject, observe=observe), wrong) if wrong else observe,
     )
 
 

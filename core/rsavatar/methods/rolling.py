@@ -16,7 +16,7 @@ class RollingShutterAvatar(AbstractMethod):
         return sub_frame_motion(case)
 
     def shutter(self, case: Case) -> AbstractShutter:
-        """Rows, blurred where exposed for long (eq. rs), or T bands (eq. rs_discrete); the mid instant with ``no_rs``."""
+        """Rows, blurred where exposed for long (eq. rs), or T bands (eq. rs_discrete); the mid one with ``no_rs``."""
         if case.spec.ablation.no_rs:
             return Instant()
         if case.spec.T != "scanline":

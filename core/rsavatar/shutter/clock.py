@@ -20,7 +20,8 @@ class ReadoutClock(torch.nn.Module):
     """What the given schedule is off by, per camera; starts at nothing.
 
     ``stretch`` [C] is the readout's correction as a part of the given readout, ``shift`` [C] the trigger's in frame
-    periods; each exists only where it is in ``unknown``. Both are of order 1, so one step size serves.
+    periods; each exists only where it is in ``unknown``. Both are of order 1, so one step size serves. They are float32
+    as all parameters are: torch 2.13's fused Adam hardly moves float64 ones.
     """
 
     stretch: torch.nn.Parameter | None
@@ -31,19 +32,19 @@ class ReadoutClock(torch.nn.Module):
         super().__init__()
         self.cameras, self.period = cameras, period
         for name, word in (("stretch", "readout"), ("shift", "trigger")):
-            free = torch.nn.Parameter(torch.zeros(cameras, dtype=torch.float64)) if word in unknown else None
+            free = torch.nn.Parameter(torch.zeros(cameras)) if word in unknown else None
             self.register_parameter(name, free)
 
     def readout_factors(self) -> Tensor:
         """[C] true readouts over given ones."""
         none = torch.zeros(self.cameras, dtype=torch.float64)
-        return 1.0 + (none if self.stretch is None else self.stretch)
+        return 1.0 + (none if self.stretch is None else self.stretch.double())
 
     def trigger_shifts(self) -> Tensor:
         """[C] true triggers minus given ones, source frames; their mean is 0 (the gauge)."""
         if self.shift is None:
             return torch.zeros(self.cameras, dtype=torch.float64)
-        return self.period * (self.shift - self.shift.mean())
+        return self.period * (self.shift - self.shift.mean()).double()
 
     def forward(self, camera: int, offsets: Tensor, reading: Tensor) -> Tensor:
         """Corrected instants [D] of an image of ``camera`` (an index).
