@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rsavatar.errors import SpecError
-from rsavatar.report.tables import PAPER_MAIN, Row, render, render_main, render_per_subject
+from rsavatar.report.tables import PAPER_MAIN, TABLES, Row, render, render_main, render_per_subject
 
 BASE = Row(
     method="rs-avatar", subject="wave", seed=0, psnr=24.0, ssim=0.8, flip=0.1, lpips=0.15, joint_mm=12.0,
@@ -118,7 +118,7 @@ def test_a_subjects_own_cameras_are_no_other_protocol() -> None:
     assert table["provenance"]["protocol"] == ["mask_radius_px 2"]
 
 
-@pytest.mark.parametrize("name", ["main", "per-subject"])
+@pytest.mark.parametrize("name", ["main", "per-subject", "shutter", "cost"])
 @pytest.mark.parametrize("fmt", ["json", "csv", "md", "tex"])
 def test_every_format_carries_its_provenance(name: str, fmt: str) -> None:
     text = render(name, TWO_METHODS, fmt)
@@ -178,12 +178,13 @@ some_rows = st.lists(
         seed=st.integers(0, 2),
         lpips=st.none() | values,
         joint_mm=st.none() | values,
+        settings=st.sampled_from([(), (("T", "K"),), (("T", "scanline"), ("ablation", "no_rs"))]),
     ),
     max_size=8,
 )
 
 
-@given(some_rows, st.sampled_from(["main", "per-subject"]), st.sampled_from(["json", "csv", "md", "tex"]), st.randoms())
+@given(some_rows, st.sampled_from(sorted(TABLES)), st.sampled_from(["json", "csv", "md", "tex"]), st.randoms())
 def test_the_order_of_rows_does_not_matter(rows: list[Row], name: str, fmt: str, shuffle: random.Random) -> None:
     text = render(name, rows, fmt)
     shuffle.shuffle(rows)
@@ -191,8 +192,9 @@ def test_the_order_of_rows_does_not_matter(rows: list[Row], name: str, fmt: str,
 
 
 def test_unknown_names_and_formats_are_refused() -> None:
-    with pytest.raises(SpecError, match="table: expected one of main, per-subject, got 'cost'"):
-        render("cost", [], "md")
+    wanted = "table: expected one of main, ablation, per-subject, shutter, cost, got 'costs'"
+    with pytest.raises(SpecError, match=wanted):
+        render("costs", [], "md")
     with pytest.raises(SpecError, match="format: expected one of json, csv, md, tex, got 'html'"):
         render("main", [], "html")
 

@@ -39,6 +39,7 @@ class Table:
     rows: tuple[tuple[Cell, ...], ...]
     notes: tuple[str, ...]
     stamp: tuple[tuple[str, tuple[str, ...]], ...]
+    title: str = ""
 
 
 def write(table: Table, fmt: str) -> str:
@@ -64,6 +65,7 @@ def _json(table: Table) -> str:
     columns = [{"key": c.key, "title": c.title} for c in table.columns]
     whole = {
         "table": table.name,
+        "title": table.title,
         "columns": columns,
         "rows": rows,
         "notes": table.notes,
@@ -98,20 +100,23 @@ def _md(table: Table) -> str:
 
 
 def _tex(table: Table) -> str:
-    """A booktabs ``table`` environment; the stamp is in comments."""
+    """A booktabs ``table`` without the columns that say nothing; notes in the caption, the stamp in comments."""
 
     def line(texts: list[str]) -> str:
         return "    " + " & ".join(texts) + r" \\" + "\n"
 
-    body = [[rf"\textbf{{{_escape(c.text)}}}" if c.best else _escape(c.text) for c in cells] for cells in table.rows]
+    shown = [i for i, c in enumerate(table.columns) if c.words or any(cells[i].text != NOTHING for cells in table.rows)]
+    columns = [table.columns[i] for i in shown]
+    picked = [[cells[i] for i in shown] for cells in table.rows]
+    body = [[rf"\textbf{{{_escape(c.text)}}}" if c.best else _escape(c.text) for c in cells] for cells in picked]
     comments = "".join(f"% {_one_line(name)}: {', '.join(map(_one_line, values))}\n" for name, values in table.stamp)
-    notes = "".join(f"  \\par {_escape(note)}\n" for note in table.notes)
+    caption = " ".join(filter(None, (rf"\textbf{{{_escape(table.title)}}}", *map(_escape, table.notes))))
     return (
-        f"{comments}\\begin{{table}}[t]\n  \\centering\\footnotesize\n"
-        f"  \\begin{{tabular}}{{{''.join('l' if c.words else 'r' for c in table.columns)}}}\n    \\toprule\n"
-        f"{line([_escape(c.title) for c in table.columns])}    \\midrule\n"
-        f"{''.join(map(line, body))}    \\bottomrule\n  \\end{{tabular}}\n{notes}"
-        f"  \\label{{tab:{table.name}}}\n\\end{{table}}\n"
+        f"{comments}\\begin{{table}}[t]\n  \\centering\\footnotesize\n  \\setlength{{\\tabcolsep}}{{3.5pt}}\n"
+        f"  \\begin{{tabular}}{{{''.join('l' if c.words else 'r' for c in columns)}}}\n    \\toprule\n"
+        f"{line([_escape(c.title) for c in columns])}    \\midrule\n"
+        f"{''.join(map(line, body))}    \\bottomrule\n  \\end{{tabular}}\n"
+        f"  \\caption{{{caption}}}\n  \\label{{tab:{table.name}}}\n\\end{{table}}\n"
     )
 
 
