@@ -6,7 +6,7 @@ rows of the ``events`` table.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -29,6 +29,7 @@ class Progress:
     loss: float | None = None
     psnr: float | None = None
     gaussians: int | None = None
+    work: Mapping[str, float] | None = None  # of training: what the steps since the last look drew, and left out
 
     @property
     def eta_seconds(self) -> float:

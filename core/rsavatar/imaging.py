@@ -35,6 +35,11 @@ class Schedule:
     reading: Tensor | None = None  # [T * D] the part of ``offsets`` that is proportional to the readout
 
 
+def chebyshev_nodes(count: int) -> list[float]:
+    """``count`` Chebyshev nodes in [-1, 1], falling."""
+    return _nodes(count)[0]
+
+
 @cache
 def _nodes(count: int) -> tuple[list[float], Tensor]:
     """Chebyshev nodes in [-1, 1], and the matrix [D, D] from values there to monomial coefficients."""

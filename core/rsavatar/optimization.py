@@ -17,9 +17,13 @@ from rsavatar.errors import DivergedError, expected
 from rsavatar.events import Checkpointed
 from rsavatar.imaging import Actor
 from rsavatar.motion.base import Continuity
+from rsavatar.render.base import Scene
+from rsavatar.skipping import Nodes, Settled
+from rsavatar.spec import SKIPS, Skip
 
 BLOCK = 50  # steps between refreshes of the skinning weights; all that saves state happens between blocks
 MOST_REJECTED = 50  # rejected steps in a row before training is called diverged
+DOUBT_AFTER = 500  # steps: before, losses tell how far the avatar has come with an image
 FAR = 3.0  # times the best block's mean loss: diverged. Sound runs, density control included, stayed within twice
 
 
@@ -61,16 +65,21 @@ class Settings:
     rates: Rates = field(default_factory=Rates)
     sh_from: int = 1000  # step at which the colours' linear harmonics start
     ssim_weight: float = 0.0
+    skip: frozenset[Skip] = frozenset(SKIPS)
     doubt: bool = False
     doubt_from: float = 0.2  # part of the run after which images that contradict all others are left out
 
     def degree(self, step: int) -> int:
         """Degree of the colours' harmonics at ``step``."""
-        return self.sh_degree if step >= self.sh_from else 0
+        return self.sh_degree if step >= self.sh_from or not self.skips("harmonics") else 0
+
+    def skips(self, what: Skip) -> bool:
+        """Whether a kind of work is left out."""
+        return what in self.skip
 
     def doubts(self, step: int) -> bool:
         """Whether images are judged after ``step``."""
-        return self.doubt and self.doubt_from * self.iterations <= step < self.iterations
+        return self.doubt and max(self.doubt_from * self.iterations, DOUBT_AFTER) <= step < self.iterations
 
     def closes_block(self, step: int) -> bool:
         """Whether a block of steps ends at ``step`` (counted from 1)."""
@@ -124,6 +133,8 @@ class State:
         self.skin_optimizer = Adam([{"params": skin}], rates.skin_offset)
         self.gradients = ScreenGradients(actor.avatar.count)
         self.doubt = Doubt(images)
+        self.nodes = Nodes(images)
+        self.settled = Settled(images)
         self.largest = rates.largest
         self.step = 0
         self.rejected = 0
@@ -132,6 +143,12 @@ class State:
         self.losses: list[float] = []  # of the block's accepted steps
         self.best = math.inf  # least mean loss of a block
         self.seconds = 0.0
+
+    def note(self, index: int, loss: float, scene: Scene) -> None:
+        """Remember what looking at image ``index`` showed."""
+        self.doubt.note(index, loss)
+        self.settled.note(index, loss)
+        self.nodes.note(index, scene)
 
     def advance(self, actor: Actor, screen: Tensor, loss: Tensor, size: tuple[int, int]) -> None:
         """Take the optimiser's step on the gradients at hand, or reject them where they are not finite.
@@ -227,6 +244,8 @@ class Saver:
                 tensors |= {f"{prefix}.{i}.{key}": value for key, value in moments.items()}
         tensors |= {"gradients.total": state.gradients.total, "gradients.seen": state.gradients.seen}
         tensors |= {"doubt.losses": state.doubt.losses, "doubt.doubted": state.doubt.doubted}
+        tensors |= {"nodes.needed": state.nodes.needed, "nodes.visits": state.nodes.visits}
+        tensors |= {"settled.last": state.settled.last, "settled.calm": state.settled.calm}
         tensors["progress"] = torch.tensor([state.rejected, state.seconds, state.best], dtype=torch.float64)
         return Checkpointed(state.step, str(self.path), checkpoint.write(self.path, tensors, self.owner, state.step))
 
@@ -250,6 +269,8 @@ class Saver:
             optimizer.load_state_dict(saved)
         state.gradients.total, state.gradients.seen = tensors["gradients.total"], tensors["gradients.seen"]
         state.doubt.losses, state.doubt.doubted = tensors["doubt.losses"], tensors["doubt.doubted"]
+        state.nodes.needed, state.nodes.visits = tensors["nodes.needed"], tensors["nodes.visits"]
+        state.settled.last, state.settled.calm = tensors["settled.last"], tensors["settled.calm"]
         rejected, state.seconds, state.best = tensors["progress"].tolist()
         state.rejected = int(rejected)
         state.step = step

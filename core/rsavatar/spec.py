@@ -21,6 +21,8 @@ from rsavatar.catalog import METHODS
 from rsavatar.errors import SpecError, expected
 
 Preset = Literal["smoke", "draft", "paper"]
+Skip = Literal["body", "nodes", "harmonics", "networks", "settled"]  # what each leaves out: rsavatar.skipping
+SKIPS: tuple[Skip, ...] = ("body", "nodes", "harmonics", "networks")  # those that a job uses unless told otherwise
 Unknown = Literal["readout", "trigger"]  # of a camera's schedule: rho_c and delta_c
 Bands = Annotated[int, Field(ge=1, le=8192)] | Annotated[str, Field(pattern=r"^([2-9]|[1-9][0-9])?K$|^scanline$")]
 BANDS_WANTED = "an integer from 1 to 8192, K, 2K to 99K, or scanline"
@@ -52,7 +54,10 @@ class Ablation(BaseModel):
 
 
 class Disturbance(BaseModel):
-    """What is made worse than the subject gives it, to measure what that costs. All that is random follows the seed."""
+    """What is given otherwise than the subject has it, to measure what that costs; the truth stays what it was.
+
+    All that is random follows the job's seed.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -61,6 +66,9 @@ class Disturbance(BaseModel):
     fit: float = Field(1.0, ge=0, le=10, description="factor on the initial fit's error; needs a true motion")
     missing: float = Field(0.0, ge=0, lt=1, description="share of the training images that are not there")
     masks: float = Field(0.0, ge=0, lt=1, description="share of the training images whose mask is wrong")
+    capture: Literal["as it was", "global shutter"] = Field(
+        "as it was", description="train on the sharp mid-row frames that a global shutter would have taken instead"
+    )
 
     def any(self) -> bool:
         """Whether anything is disturbed."""
@@ -100,16 +108,18 @@ class JobSpec(BaseModel):
     )
     sh_degree: int = Field(1, ge=0, le=1, description="highest spherical-harmonics degree of the colours")
     mask_weight: float = Field(0.5, ge=0, le=10, description="weight of the L1 between opacity and body mask")
+    ssim_weight: float = Field(0.0, ge=0, le=10, description="weight of 1 - SSIM beside the L1")
     densify: bool = Field(True, description="adaptive density control: clone, split, prune")
     checkpoint_every: int = Field(1000, ge=1, description="steps between checkpoints")
 
+    skip: tuple[Skip, ...] = Field(SKIPS, description="work left out where the scene does not need it")
     calibrate: tuple[Unknown, ...] = Field((), description="what of the schedule is learned: readout, trigger")
     exposure_frames: float | None = Field(
         None, ge=0, le=1000, description="exposure of a row in source frames; none = the subject's own; 0 = ignored"
     )
     exposure_samples: int = Field(4, ge=1, le=64, description="scans that an exposure is the mean of")
     doubt: bool = Field(True, description="leave out training images that contradict all others")
-    disturb: Disturbance = Field(Disturbance(), description="what is made worse than given, as an experiment")
+    disturb: Disturbance = Field(Disturbance(), description="what is given otherwise, as an experiment")
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

@@ -6,7 +6,7 @@ import gc
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -17,9 +17,10 @@ from rsavatar.errors import DivergedError, Interrupted, expected
 from rsavatar.events import Note, Progress, Report
 from rsavatar.geometry.cameras import Camera
 from rsavatar.imaging import Actor, Schedule, expose
-from rsavatar.losses import l1
-from rsavatar.optimization import Saver, Settings, SkinBlock, State
+from rsavatar.losses import dissimilarity, l1
+from rsavatar.optimization import BLOCK, Saver, Settings, SkinBlock, State
 from rsavatar.render.base import Rendering
+from rsavatar.skipping import Work
 
 REPORT_EVERY = 25  # steps
 
@@ -70,17 +71,20 @@ def fit(
     state = saver.restore(actor, settings, len(observations))
     gc.freeze()  # what is alive now lives to the end: the collector need not walk it again and again
     begun = time.perf_counter() - state.seconds
-    skin, trusted = SkinBlock(actor), state.doubt.trusted
+    skin, chosen, work = SkinBlock(actor), _chosen(state, settings), Work()
     while state.step < settings.iterations:
-        index = trusted[pick(settings.seed, state.step, len(trusted))]
+        index = chosen[pick(settings.seed, state.step, len(chosen))]
         seen = observations[index]
         state.set_rates(settings)
 
-        schedule = actor.timed(seen.schedule)
+        schedule = actor.timed(state.nodes.choose(index, seen.schedule) if settings.skips("nodes") else seen.schedule)
         scene = actor.scene(seen.frame, seen.camera, schedule, skin.weights, settings.degree(state.step))
         image = expose(scene)
         loss = l1(image, seen.rgb, seen.mask, 0.0, settings.mask_weight)
-        state.doubt.note(index, float(loss.detach()))
+        state.note(index, float(loss.detach()), scene)
+        work.add(scene, image, seen.full_size)
+        if settings.ssim_weight:
+            loss = loss + settings.ssim_weight * dissimilarity(image, seen.rgb)
         if settings.lambda_reg:
             loss = loss + settings.lambda_reg * actor.motion.penalty(settings.continuity)
         torch.autograd.backward(loss)
@@ -89,14 +93,14 @@ def fit(
         state.seconds = time.perf_counter() - begun
         last = state.step == settings.iterations
         if last or state.step % REPORT_EVERY == 0:
-            report(_progress(state, settings, float(loss.detach()), image, seen))
+            saved = work.means(resting=len(state.doubt.trusted) - len(chosen))
+            report(replace(_progress(state, settings, float(loss.detach()), image, seen), work=saved))
         if last or settings.closes_block(state.step):
             skin.close(state.skin_optimizer)
             if rejected := state.close_block(actor):
                 report(Note(f"step {state.step}: {rejected} steps of this block rejected, no finite loss and gradient"))
             if settings.doubts(state.step) and (left := state.doubt.judge(_cameras(observations))):
                 report(Note(f"step {state.step}: left out as contradicting all others: {_labels(observations, left)}"))
-                trusted = state.doubt.trusted
             if settings.density and settings.density.due(state.step):
                 report(Note(_control_density(actor, state, settings, settings.density)))
             stop = not last and should_stop()
@@ -104,6 +108,9 @@ def fit(
                 report(saver.save(actor, state))
             if stop:
                 raise Interrupted(f"stopped at step {state.step} of {settings.iterations}; run again to go on")
+            skin, chosen = SkinBlock(actor), _chosen(state, settings)
+        elif not settings.skips("networks"):
+            skin.close(state.skin_optimizer)
             skin = SkinBlock(actor)
     doubted = tuple(seen.label for seen, bad in zip(observations, state.doubt.doubted.tolist(), strict=True) if bad)
     return Trained(state.seconds, state.rejected, saver.path, doubted)
@@ -114,6 +121,12 @@ def pick(seed: int, step: int, count: int) -> int:
     epoch, place = divmod(step, count)
     order = torch.randperm(count, generator=torch.Generator().manual_seed(seed * 1_000_003 + epoch))
     return int(order[place])
+
+
+def _chosen(state: State, settings: Settings) -> list[int]:
+    """Which observations the next block of steps looks at."""
+    trusted = state.doubt.trusted
+    return state.settled.awake(trusted, state.step // BLOCK) if settings.skips("settled") else trusted
 
 
 def _cameras(observations: Sequence[Observation]) -> Tensor:

@@ -105,7 +105,7 @@ def test_the_hash_ignores_priority_and_nothing_else() -> None:
         "regime": "authors", "continuity": "paper", "perturbation": "positive", "sh_degree": 0,
         "mask_weight": 0.25, "densify": False, "checkpoint_every": 7, "ablation": {"no_rs": True},
         "calibrate": ["readout"], "exposure_samples": 2, "doubt": False, "disturb": {"masks": 0.1},
-        "exposure_frames": 0.0,
+        "exposure_frames": 0.0, "ssim_weight": 0.2, "skip": ["body"],
     }  # fmt: skip
     names = {field.alias or name for name, field in JobSpec.model_fields.items()}
     assert set(changes) == names - {"priority"}  # a new word must be given a change here

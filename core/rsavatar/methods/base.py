@@ -140,7 +140,7 @@ def _observe(method: AbstractMethod, case: Case, name: str, frame: int) -> Obser
     box = body_box(mask)
     if box is None:
         return None
-    x0, y0, x1, y1 = box
+    x0, y0, x1, y1 = box if "body" in case.spec.skip else (0, 0, camera.width, camera.height)
     pixels = torch.from_numpy(np.ascontiguousarray(rgb[y0:y1, x0:x1].transpose(2, 0, 1)))
     coverage = torch.from_numpy(np.ascontiguousarray(mask[y0:y1, x0:x1]))
     schedule, cut = _schedule(method, case, name, (y0, y1)), camera.cropped(x0, y0, x1, y1)
@@ -185,9 +185,11 @@ def settings(case: Case) -> Settings:
         lambda_reg=0.0 if spec.ablation.no_reg else spec.lambda_reg,
         continuity=spec.continuity,
         mask_weight=spec.mask_weight,
+        ssim_weight=spec.ssim_weight,
         sh_degree=spec.sh_degree,
         checkpoint_every=spec.checkpoint_every,
         density=(DensityRules() if authors else DensityRules(gradient=4e-4)) if spec.densify else None,
         rates=Rates() if authors else POSE_FIRST,
         doubt=spec.doubt,
+        skip=frozenset(spec.skip),
     )
