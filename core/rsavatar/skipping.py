@@ -4,7 +4,7 @@
 |---|---|---|
 | body | rows and columns of an image beyond the body's box | nothing: the loss there is the background's |
 | nodes | pose nodes of a readout in which the body moves too little to need them | at most ``TOLERANCE_PX`` pixels |
-| harmonics | the colours' linear harmonics before step ``sh_from``, when colours are not yet there to refine | training |
+| harmonics | the colours' linear harmonics before step ``sh_from``, when no colour is there to refine | training |
 | networks | refreshing the skinning network more often than once a block of steps | training |
 | settled | every second visit to an image whose loss no longer changes | training; off unless asked for |
 
