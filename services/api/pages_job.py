@@ -96,7 +96,8 @@ def _source(job: Job) -> str:
 
 def heat_map(scores: Sequence[Score], metric: str) -> HeatMap | None:
     """The map of a metric, shaded between its own 2nd and 98th percentile; bright is good."""
-    names = tuple(dict.fromkeys(score.metric for score in scores))
+    order = {key: i for i, (key, *_) in enumerate(MEANS)}
+    names = tuple(sorted({score.metric for score in scores}, key=lambda name: (order.get(name, len(order)), name)))
     metric = metric if metric in names else "psnr"
     values = {(s.camera, s.frame): s.value for s in scores if s.metric == metric}
     known = sorted(v for v in values.values() if v is not None)

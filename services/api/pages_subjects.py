@@ -65,7 +65,17 @@ def card_of(store: Store, subject: Subject, job_id: str | None) -> Card:
     elif _picture(subject) is not None:
         image = f"/subjects/{subject.name}/thumbnail"
     licence = meta.get("licence")
-    return Card(subject, image, tuple(_facts(meta)), report, str(licence) if licence else None)
+    facts = _facts(meta) if meta else _facts_of_job(store, job_id)
+    return Card(subject, image, tuple(facts), report, str(licence) if licence else None)
+
+
+def _facts_of_job(store: Store, job_id: str | None) -> list[tuple[str, str]]:
+    """What the pictures of a job tell of a subject that has no files of its own."""
+    views = [] if job_id is None else pictures.views(store, job_id)
+    if not views:
+        return []
+    training = sum("input" in view.kinds for view in views)
+    return [("Frames", str(len(views[0].frames))), ("Cameras", f"{training} + {len(views) - training}")]
 
 
 def _from_job(store: Store, job_id: str) -> str | None:

@@ -15,11 +15,15 @@ function chart(root, title) {
 }
 
 const by = (list, key) => { const found = new Map(); for (const item of list) { const k = key(item); if (!found.has(k)) found.set(k, []); found.get(k).push(item); } return found; };
-const family = (label) => label.replace(/\s*\(T.*\)|,?\s*T\s*=.*$/, "").trim();
+const family = (way) => (way.label.startsWith("+") ? "scanline, refined" : way.way.startsWith("bands") || way.label.startsWith("bands") ? "bands, one pass" : way.label.replace(/[,:(].*$/, "").trim());
+const alone = (name) => !["bands, one pass", "the paper's way"].includes(name);
 
 function render(root, result) {
   const main = result.ways.filter((w) => w.motion_px === result.main_px), place = chart(root, `Error against run time, ${result.main_px} px of motion`);
-  const traces = [...by(main, (w) => w.way)].map(([way, group]) => ({ x: group.map((w) => w.total_ms), y: group.map((w) => w.accuracy.psnr_db), text: group.map((w) => w.label), name: family(group[0].label) || way, mode: group.length > 1 ? "lines+markers" : "markers", marker: { size: group.length > 1 ? 7 : 12 }, hovertemplate: "%{text}<br>%{x:.1f} ms, %{y:.1f} dB<extra></extra>" }));
+  const traces = [...by(main, family)].map(([name, group]) => {
+    const sorted = alone(name) ? group : [...group].sort((a, b) => a.bands - b.bands);
+    return { x: sorted.map((w) => w.total_ms), y: sorted.map((w) => w.accuracy.psnr_db), text: sorted.map((w) => w.label), name, mode: alone(name) ? "markers" : "lines+markers", marker: { size: 11 }, hovertemplate: "%{text}<br>%{x:.1f} ms, %{y:.1f} dB<extra></extra>" };
+  });
   draw(place, traces, { x: { type: "log", title: { text: "forward and backward, ms" } }, y: { title: { text: "PSNR to the exact image, dB" } } });
   if (!result.orders?.length) return;
   const orders = chart(root, "Error of T bands falls as 1 / T");
@@ -27,10 +31,10 @@ function render(root, result) {
 }
 
 function growth(root, result) {
-  const names = { gaussians: "Gaussians", pixels: "image side, px", bands: "T, bands", frames: "frames", memory: "Gaussians" };
+  const names = { gaussians: "Gaussians", pixels: "image side, px", bands: "T, bands", frames: "frames", memory: "T, bands" };
   for (const [axis, curves] of by(result.curves, (c) => c.axis)) {
     const memory = curves.every((c) => c.points.every((p) => p.memory_mb !== null && p.total_ms === null)), value = (p) => (memory ? p.memory_mb : p.total_ms ?? p.step_ms ?? p.memory_mb);
-    const place = chart(root, `Growth with ${names[axis] ?? axis}`);
+    const place = chart(root, `${memory ? "Memory" : "Time"} against ${names[axis] ?? axis}`);
     draw(place, curves.map((c) => ({ x: c.points.map((p) => p.x), y: c.points.map(value), name: c.name, mode: "lines+markers" })), { x: { type: "log", title: { text: names[axis] ?? axis } }, y: { type: "log", title: { text: memory ? "memory, MB" : "forward and backward, ms" } } });
   }
 }

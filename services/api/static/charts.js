@@ -12,6 +12,7 @@ export function layout({ x, y, ...more }) {
     font: { family: css("--text"), size: 13, color: css("--ink-2") }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
     margin: { l: 60, r: 16, t: 12, b: 54 }, hovermode: "closest", legend: { orientation: "h", y: -0.24, x: 0 }, colorway: series(),
     hoverlabel: { bgcolor: css("--surface"), bordercolor: css("--rule"), font: { color: css("--ink"), family: css("--text") } },
+    modebar: { bgcolor: "rgba(0,0,0,0)", color: css("--ink-3"), activecolor: css("--accent") },
     xaxis: axis(x), yaxis: axis(y), ...more,
   };
 }

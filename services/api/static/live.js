@@ -115,7 +115,7 @@ function take(message) {
 
 function listen(jobId) {
   const link = document.getElementById("link");
-  const say = (state, text) => { if (link) { link.dataset.link = state; link.textContent = text; } };
+  const say = (state, text) => { if (link) { link.hidden = false; link.dataset.link = state; link.textContent = text; } };
   const after = document.body.dataset.newest;
   const source = new EventSource(jobId ? `${api}/jobs/${jobId}/events?after=${after}` : `${api}/events?after=${after}`);
   source.onopen = () => say("on", "live");
@@ -141,5 +141,4 @@ document.addEventListener("click", async (click) => {
 showVerbs();
 const job = document.querySelector("[data-page=job]");
 const over = job && terminal.has(job.dataset.state);
-if (over) { const link = document.getElementById("link"); if (link) link.textContent = "ended"; }
 if (!over && document.querySelector("[data-job],[data-fresh]")) listen(job?.dataset.job);

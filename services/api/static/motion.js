@@ -64,28 +64,35 @@ function project(camera, point) {
   return [u / w, v / w];
 }
 
-async function drawView() {
+function near(camera, frame, size) { // a square around the body, within the picture
+  const all = [data.found, data.truth].filter(Boolean).flatMap((d) => d[frame].flat()).map((p) => project(camera, p));
+  const xs = all.map((p) => p[0]), ys = all.map((p) => p[1]), [x0, x1, y0, y1] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
+  const side = Math.min(Math.max(...size), 1.35 * Math.max(x1 - x0, y1 - y0));
+  return { side, x: (x0 + x1 - side) / 2, y: (y0 + y1 - side) / 2 };
+}
+
+function drawView() {
   const name = data.cameras[shown.camera] ? shown.camera : trainer(), camera = data.cameras[name], frame = shown.frame;
-  const image = find("view"), kind = camera.training ? "input" : "truth", svg = find("overlay"), [width, height] = camera.size;
-  const url = `${api}/jobs/${root.dataset.source}/frames/${name}/${frame}/${kind}.png`;
-  if (image.getAttribute("src") !== url) image.src = url;
-  image.alt = `${kind === "input" ? "Rolling-shutter input" : "Truth"}, camera ${name}, frame ${frame}`;
-  const parts = [];
-  for (const [lo] of camera.slots.filter(([, , , rate]) => !rate)) if (lo) parts.push(node("line", { class: "over-seam", x1: 0, x2: width, y1: lo, y2: lo }));
-  const draw = (all, kindOf) => data.joints.forEach((_, joint) => parts.push(node("path", { class: kindOf, d: line(all[frame].map((s) => project(camera, s[joint]))) })));
-  draw(data.found, "over-found");
-  if (data.truth) draw(data.truth, "over-true");
+  const kind = camera.training ? "input" : "truth", svg = find("overlay"), [width, height] = camera.size;
+  const { side, x, y } = near(camera, frame, camera.size);
+  const parts = [node("image", { href: `${api}/jobs/${root.dataset.source}/frames/${name}/${frame}/${kind}.png`, x: 0, y: 0, width, height })];
+  const seams = camera.slots.filter(([lo, , , rate]) => !rate && lo);
+  for (const [lo] of seams) parts.push(node("line", { class: "over-seam", x1: 0, x2: width, y1: lo, y2: lo }));
+  const paths = (all, kindOf) => data.joints.forEach((_, joint) => parts.push(node("path", { class: kindOf, d: line(all[frame].map((s) => project(camera, s[joint]))) })));
+  paths(data.found, "over-found");
+  if (data.truth) paths(data.truth, "over-true");
   if (camera.training) data.joints.forEach((_, joint) => { // where a joint is when the scan reaches it
     const points = data.found[frame].map((s) => project(camera, s[joint]));
     const rows = data.offsets_frames.map((o) => ((o - camera.trigger_frames) / data.readout_frames + 0.5) * height);
     const i = points.findIndex((p, k) => k && (rows[k] - p[1]) * (rows[k - 1] - points[k - 1][1]) <= 0);
-    if (i > 0) parts.push(node("circle", { class: "over-now", cx: points[i][0], cy: points[i][1], r: Math.max(width, height) / 110 }));
+    if (i > 0) parts.push(node("circle", { class: "over-now", cx: points[i][0], cy: points[i][1], r: side / 90 }));
   });
-  svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
+  svg.setAttribute("viewBox", `${x} ${y} ${side} ${side}`);
+  svg.setAttribute("aria-label", `Joint paths over the ${kind === "input" ? "rolling-shutter input" : "truth"} of camera ${name}, frame ${frame}`);
   svg.replaceChildren(...parts);
   find("view-caption").textContent = camera.training
-    ? `Camera ${name}, frame ${frame}: paths over the readout; a dot is where the scan meets the joint.${camera.slots.length > 1 && parts.some((p) => p.classList.contains("over-seam")) ? " Blue: seams of the bands." : ""}`
-    : `Camera ${name} is held out: nothing was recorded there but the truth.`;
+    ? `Camera ${name}, frame ${frame}: paths over the readout; a dot is where the scan meets the joint.${seams.length ? " Blue: seams of the bands." : ""}`
+    : `Camera ${name}, frame ${frame}: held out, so this is the truth; choose a training camera above to see the input.`;
 }
 
 function legend() {

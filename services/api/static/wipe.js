@@ -35,6 +35,7 @@ class Look {
     this.layer = { left: root.dataset.left, right: root.dataset.right };
     this.view = { scale: 1, x: 0, y: 0 }; // of the picture, in pixels of the stage
     this.drawn = 0;
+    this.sides = new Map();
   }
 
   async start() {
@@ -154,6 +155,9 @@ class Look {
       this.find("note").textContent = "";
     } catch (error) { this.find("note").textContent = error.message; }
     if (turn !== this.drawn) return;
+    const whole = layers.find((l) => l.kind === "truth") ?? layers.find((l) => l.kind === "result") ?? layers[0];
+    this.frameBody(await load(this.url(whole.job, whole.kind)));
+    if (turn !== this.drawn) return;
     this.strip(layers);
     this.place();
     tell("rs:view", { camera: this.camera, frame: this.frame });
@@ -197,20 +201,39 @@ class Look {
     context.putImageData(a, 0, 0);
   }
 
-  fitted(width, height) { // the whole picture, in the middle
-    const scale = Math.min(width / this.size[0], height / this.size[1]);
-    return { scale, x: (width - this.size[0] * scale) / 2, y: (height - this.size[1] * scale) / 2 };
+  fitted(width, height) { // the body in the middle, with the scale of the camera's largest one so far
+    const { side, x, y } = this.body, scale = Math.min(width, height) / side;
+    return { scale, x: width / 2 - x * scale, y: height / 2 - y * scale };
+  }
+
+  frameBody(image) { // pictures are black where nobody is
+    const [width, height] = this.size, small = document.createElement("canvas"), n = 96;
+    Object.assign(small, { width: n, height: n });
+    const context = small.getContext("2d", { willReadFrequently: true });
+    context.drawImage(image, 0, 0, n, n);
+    const { data } = context.getImageData(0, 0, n, n), box = [n, n, -1, -1];
+    for (let i = 0; i < n * n; i++) {
+      if (data[4 * i] + data[4 * i + 1] + data[4 * i + 2] < 36) continue;
+      const x = i % n, y = Math.floor(i / n);
+      box[0] = Math.min(box[0], x); box[1] = Math.min(box[1], y); box[2] = Math.max(box[2], x + 1); box[3] = Math.max(box[3], y + 1);
+    }
+    const all = { side: Math.max(width, height), x: width / 2, y: height / 2 };
+    if (box[2] < 0) { this.body = all; return; }
+    const [x0, x1] = [box[0], box[2]].map((v) => v / n * width), [y0, y1] = [box[1], box[3]].map((v) => v / n * height);
+    const side = Math.min(all.side, Math.max(this.sides.get(this.camera) ?? 0, 1.18 * Math.max(x1 - x0, y1 - y0)));
+    this.sides.set(this.camera, side);
+    this.body = { side, x: (x0 + x1) / 2, y: (y0 + y1) / 2 };
   }
 
   place() {
-    if (!this.size) return;
+    if (!this.body) return;
     const { clientWidth: w, clientHeight: h } = this.stage, base = this.fitted(w, h), v = this.view;
     if (v.scale === 1) { v.x = 0; v.y = 0; }
     v.x = Math.min(0, Math.max(w - w * v.scale, v.x));
     v.y = Math.min(0, Math.max(h - h * v.scale, v.y));
     const matrix = `translate(${v.x + base.x * v.scale}px, ${v.y + base.y * v.scale}px) scale(${base.scale * v.scale})`;
     for (const pane of this.stage.querySelectorAll(".pane")) {
-      pane.classList.toggle("crisp", base.scale * v.scale > 3);
+      pane.classList.toggle("crisp", base.scale * v.scale > 9);
       for (const node of pane.children) node.style.transform = matrix;
     }
     this.stage.classList.toggle("zoomed", v.scale > 1);

@@ -1,0 +1,124 @@
+"""Pictures of every page of a running service, at 1440 and 390 px, light and dark.
+
+    python docs/screenshots.py http://127.0.0.1:8000 [--out docs/screens] [--only job home] [--subject studio]
+
+Needs Chromium and its driver. Only jobs on the built-in subject are shown unless another one is named.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import re
+import tempfile
+import time
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+from selenium import webdriver
+from selenium.webdriver.chrome.options import Options
+from selenium.webdriver.chrome.service import Service
+
+FLAGS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--hide-scrollbars",
+    "--force-device-scale-factor=1",
+)
+WIDTHS = {"wide": 1440, "narrow": 390}
+SCHEMES = ("light", "dark")
+TALLEST = 6000
+QUALITY = 84  # of a stored picture
+DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+
+
+def browser(profile: str) -> webdriver.Chrome:
+    """A fresh headless Chromium."""
+    options = Options()
+    options.binary_location = "/usr/bin/chromium"
+    for flag in (*FLAGS, f"--user-data-dir={profile}"):
+        options.add_argument(flag)
+    return webdriver.Chrome(options, Service("/usr/bin/chromedriver"))
+
+
+def ask(url: str) -> Any:
+    """JSON of the service."""
+    with DIRECT.open(url, timeout=20) as reply:
+        return json.load(reply)
+
+
+def pages(base: str, subject: str) -> dict[str, str]:
+    """Name to address of everything that is to be shown; what has no example yet is left out."""
+    found = {"home": "/", "jobs": "/jobs", "new": "/jobs/new", "grids": "/grids", "figures": "/figures"}
+    found |= {"benchmarks": "/benchmarks", "subjects": "/subjects", "error": "/jobs/00000000-0000-0000-0000-000000000000"}
+    done = ask(f"{base}/api/v1/jobs?state=succeeded&subject={subject}&limit=200")["items"]
+    newest = {job["method"]: job["id"] for job in reversed(done)}
+    if "rs-avatar" in newest:
+        found |= {"job": f"/jobs/{newest['rs-avatar']}", "viewer": f"/jobs/{newest['rs-avatar']}/viewer"}
+    if len(newest) > 1:
+        found["compare"] = "/jobs/compare?" + "&".join(f"id={job}" for job in list(newest.values())[:4])
+    if grids := ask(f"{base}/api/v1/grids?limit=1")["items"]:
+        found["grid"] = f"/grids/{grids[0]['id']}"
+    return found
+
+
+def shoot(driver: webdriver.Chrome, url: str, width: int, scheme: str, path: Path) -> None:
+    """One page, whole."""
+    emulation = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+    driver.execute_cdp_cmd("Emulation.setEmulatedMedia", emulation)
+    _size(driver, width, 900)
+    driver.get(url)
+    time.sleep(2.0)
+    height = driver.execute_script("return document.documentElement.scrollHeight")
+    wide = driver.execute_script("return document.documentElement.scrollWidth")
+    if wide > width:
+        print(f"  {path.stem}: scrolls sideways, {wide} px of {width}")
+    _size(driver, width, min(int(height), TALLEST))
+    time.sleep(1.0)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    picture = Image.open(io.BytesIO(driver.get_screenshot_as_png())).convert("RGB")
+    picture.save(path, quality=QUALITY, method=6) if path.suffix == ".webp" else picture.save(path)
+
+
+def _size(driver: webdriver.Chrome, width: int, height: int) -> None:
+    metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+
+
+def main() -> None:
+    """Take all pictures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("base")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "screens")
+    parser.add_argument("--only", nargs="*", default=[])
+    parser.add_argument("--subject", default="studio")
+    parser.add_argument("--widths", nargs="*", default=list(WIDTHS), choices=list(WIDTHS))
+    parser.add_argument("--schemes", nargs="*", default=list(SCHEMES), choices=list(SCHEMES))
+    parser.add_argument("--suffix", default=".webp", choices=[".webp", ".png"])
+    options = parser.parse_args()
+    base = options.base.rstrip("/")
+    with tempfile.TemporaryDirectory() as profile:
+        driver = browser(profile)
+        for name, address in pages(base, options.subject).items():
+            if options.only and name not in options.only:
+                continue
+            for width in options.widths:
+                for scheme in options.schemes:
+                    file = re.sub(r"[^a-z-]", "", f"{name}-{width}-{scheme}") + options.suffix
+                    shoot(driver, base + address, WIDTHS[width], scheme, options.out / file)
+        for entry in driver.get_log("browser"):
+            print(f"  console: {entry['level']} {entry['message']}")
+        driver.quit()
+
+
+if __name__ == "__main__":
+    main()
