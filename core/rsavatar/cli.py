@@ -62,6 +62,20 @@ examples:
   rsavatar data studio data/studio
   rsavatar data studio data/tall --seed 3 --size 256 --frames 24
 """
+LOGIN = """\
+Reads a token (from the terminal, or the first line of standard input), tries it, and keeps it in
+~/.config/rsavatar/tokens.json for this address. RSAVATAR_TOKEN in the environment goes before what is kept.
+
+example:
+  rsavatar login --url https://lab.example < admin-token
+"""
+TOKEN = """\
+Prints the token, which is shown this once. `submit` covers `read`, and `admin` covers both.
+
+examples:
+  rsavatar token create laptop --owner ann
+  rsavatar token create dashboards --owner monitoring --scope read --days 0
+"""
 WATCH = (
     "Follows a job's progress and prints its results. A broken connection is taken up again. Ctrl-C only stops looking."
 )
@@ -156,8 +170,26 @@ def _add_remote(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
     subjects = _add(verbs, "subjects", "rsavatar.cli_remote:subjects", "list subjects, or make one known")
     subjects.add_argument("--add", nargs=2, metavar=("NAME", "PATH"), help="a folder on the service's machine")
-    for parser in (submit, jobs, table, subjects, *(verbs.choices[n] for n in ("watch", "cancel", "retry"))):
+    subjects.add_argument("--upload", nargs=2, metavar=("NAME", "FILE"), help="a .zip or .tar.gz of yours")
+    subjects.add_argument("--remove", metavar="NAME", help="forget a subject; an uploaded one's files are removed")
+    access = _add_access(verbs)
+    for parser in (submit, jobs, table, subjects, *access, *(verbs.choices[n] for n in ("watch", "cancel", "retry"))):
         parser.add_argument("--url", help="the service (default: $RSAVATAR_URL, else http://127.0.0.1:8000)")
+
+
+def _add_access(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> list[argparse.ArgumentParser]:
+    login = _add(verbs, "login", "rsavatar.cli_access:login", "keep a token for the service", LOGIN)
+    login.add_argument("--forget", action="store_true", help="remove the kept token")
+    nouns = verbs.add_parser("token", help="issue, list or revoke tokens").add_subparsers(required=True, metavar="VERB")
+    create = _add(nouns, "create", "rsavatar.cli_access:create", "print a new token", TOKEN)
+    create.add_argument("name", metavar="NAME", help="what it is for")
+    create.add_argument("--owner", required=True, help="whose jobs it makes")
+    create.add_argument("--scope", choices=["read", "submit", "admin"], default="submit", help="default: submit")
+    create.add_argument("--days", type=float, default=90.0, metavar="N", help="its life; 0 = for ever (default: 90)")
+    listing = _add(nouns, "list", "rsavatar.cli_access:show", "list tokens, newest first")
+    revoke = _add(nouns, "revoke", "rsavatar.cli_access:revoke", "end a token, and the logins that it made, at once")
+    revoke.add_argument("token_id", metavar="ID")
+    return [login, create, listing, revoke]
 
 
 def _add(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import sys
+from pathlib import Path
 from typing import Any
 
 from rsavatar.cli_progress import Display, print_means
@@ -59,12 +60,19 @@ def retry(arguments: argparse.Namespace) -> int:
 
 
 def subjects(arguments: argparse.Namespace) -> int:
-    """``rsavatar subjects``: the known subjects, after making one known where asked to."""
+    """``rsavatar subjects``: the known subjects, after adding or removing one where asked to."""
     with Client(arguments.url) as client:
         if arguments.add:
             client.register_subject(*arguments.add)
+        if arguments.upload:
+            client.upload_subject(arguments.upload[0], Path(arguments.upload[1]))
+        if arguments.remove:
+            client.remove_subject(arguments.remove)
         for subject in client.subjects():
-            print(f"{subject['name']:<24} {subject.get('path') or 'built in'}")
+            print(f"{subject['name']:<24} {subject['state']:<9} {subject.get('path') or 'built in'}")
+            for finding in subject["info"].get("report", []):
+                if finding["severity"] == "error":
+                    print(f"{'':<24} {finding['what']}: expected {finding['expected']}, got {finding['got']}")
     return 0
 
 

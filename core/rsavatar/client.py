@@ -9,12 +9,14 @@ import time
 import uuid
 from collections.abc import Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 from urllib.parse import quote
 
 import httpx
 
+from rsavatar.credentials import token_for
 from rsavatar.errors import ClientError
 
 DEFAULT_URL = "http://127.0.0.1:8000"
@@ -39,10 +41,11 @@ class ServerEvent:
 class Client:
     """A connection to one service. Use as a context manager, or ``close`` it.
 
+    ``token`` is the one that was given, else what ``rsavatar.credentials`` finds for the address.
     Every method raises ``ClientError`` when the service refuses (its problem's title and detail) or cannot be reached.
     """
 
-    def __init__(self, base_url: str | None = None, timeout_s: float = 30.0) -> None:
+    def __init__(self, base_url: str | None = None, timeout_s: float = 30.0, token: str | None = None) -> None:
         self.url = (base_url or os.environ.get(URL_VARIABLE) or DEFAULT_URL).rstrip("/")
         try:
             url = httpx.URL(self.url)
@@ -51,7 +54,9 @@ class Client:
         if url.scheme not in {"http", "https"} or not url.host:
             raise ClientError(f"not an address: {self.url!r}", "expected http://HOST:PORT")
         direct = _is_loopback(url.host)  # a proxy cannot reach this machine's loopback
-        self._http = httpx.Client(base_url=f"{self.url}/api/v1", timeout=timeout_s, trust_env=not direct)
+        known = token or token_for(self.url)
+        proof = {"authorization": f"Bearer {known}"} if known else {}
+        self._http = httpx.Client(base_url=f"{self.url}/api/v1", timeout=timeout_s, trust_env=not direct, headers=proof)
 
     def __enter__(self) -> Self:
         return self
@@ -111,6 +116,48 @@ class Client:
         """Make a folder on the service's machine known as a subject. Returns the subject."""
         subject: Json = self._json("POST", "/subjects", json={"name": name, "path": path})
         return subject
+
+    def upload_subject(self, name: str, archive: Path) -> Json:
+        """Send a .zip or .tar.gz of a subject's folder. Returns the subject, which a worker checks before its use."""
+        kind = "application/zip" if archive.suffix.lower() == ".zip" else "application/gzip"
+        try:
+            with archive.open("rb") as content:
+                sent = self._json(
+                    "POST",
+                    "/subjects",
+                    params={"name": name},
+                    content=content,
+                    headers={"content-type": kind, "content-length": str(archive.stat().st_size)},
+                    timeout=None,
+                )
+        except OSError as error:
+            raise ClientError(f"cannot read {archive}", str(error.strerror)) from None
+        subject: Json = sent
+        return subject
+
+    def remove_subject(self, name: str) -> None:
+        """Make a subject unknown; the files of an uploaded one are removed."""
+        self._request("DELETE", _path("subjects", name))
+
+    def whoami(self) -> Json:
+        """Owner and scopes that the service sees in this connection."""
+        me: Json = self._json("GET", "/tokens/me")
+        return me
+
+    def tokens(self) -> list[Json]:
+        """All tokens, newest first, without their secrets."""
+        return list(self._json("GET", "/tokens"))
+
+    def issue_token(self, name: str, owner: str, scope: str, days: float | None) -> Json:
+        """A new token; its ``secret`` is told this once."""
+        body = {"name": name, "owner": owner, "scopes": [scope], "days": days}
+        token: Json = self._json("POST", "/tokens", json=body)
+        return token
+
+    def revoke_token(self, token_id: str) -> Json:
+        """End a token at once. Returns it."""
+        token: Json = self._json("DELETE", _path("tokens", token_id))
+        return token
 
     def events(self, job_id: str, last_event_id: str | None = None) -> Generator[ServerEvent, None, None]:
         """Events of a job, from the beginning or after ``last_event_id``, until the job has ended.

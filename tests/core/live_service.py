@@ -50,9 +50,9 @@ class Service:
 
 
 @contextmanager
-def live_service(home: Path) -> Iterator[Service]:
+def live_service(home: Path, *, require_token: bool = False) -> Iterator[Service]:
     """Serve until the block ends."""
-    settings = Settings(home=home, poll_seconds=0.02, ping_seconds=0.1)
+    settings = Settings(home=home, poll_seconds=0.02, ping_seconds=0.1, require_token=require_token)
     make_home(settings)
     store = Store(settings)
     schema.migrate(store)
