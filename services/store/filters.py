@@ -197,8 +197,13 @@ def where(filters: Filters) -> list[ColumnElement[bool]]:
         (JobRow.method.expression, filters.method),
         (JobRow.subject.expression, filters.subject),
         (JobRow.grid_id.expression, filters.grid),
+        (_spec("preset").as_string(), filters.preset),
     ]
     conditions = [column == value for column, value in wanted if value is not None]
+    if filters.tag is not None:
+        conditions.append(JobRow.id.in_(select(TagRow.job_id).where(TagRow.tag == filters.tag)))
+    if filters.seeds:
+        conditions.append(_spec("seed").as_integer().in_(filters.seeds))
     node = query.parse(filters.query or "")
     return conditions if node is None else [*conditions, to_sql(node)]
 

@@ -11,8 +11,9 @@ from sqlalchemy.orm import Session
 
 from services.errors import ConflictError
 from services.store import curves as thinned
+from services.store.filters import where
 from services.store.jobs import get, to_job
-from services.store.records import Claim, Outcome, Point, Score, State, TableEntry
+from services.store.records import Claim, Filters, Outcome, Point, Score, State, TableEntry
 from services.store.session import Store, db_now
 from services.store.tables import JobRow, PointRow, ResultRow, ScoreRow
 
@@ -85,14 +86,20 @@ def outcome_of(store: Store, job_id: str) -> Outcome:
         return Outcome(row.means, row.per_camera, row.protocol, row.provenance, *numbers, scores)
 
 
-def table_entries(store: Store, preset: str | None = None) -> list[TableEntry]:
-    """The newest succeeded job of every spec, in the order of method, subject, seed and id."""
-    newest = select(func.max(JobRow.id)).where(JobRow.state == State.SUCCEEDED).group_by(JobRow.spec_sha256)
+def table_entries(store: Store, preset: str | None = None, filters: Filters | None = None) -> list[TableEntry]:
+    """The newest succeeded job of every spec, in the order of method, subject, seed and id; a reused result once.
+
+    ``preset`` is short for filters that name nothing else.
+
+    Raises:
+        RequestError: if the query of ``filters`` cannot be understood, saying where.
+    """
+    chosen = (JobRow.state == State.SUCCEEDED, *where(filters or Filters(preset=preset)))
+    newest = select(func.max(JobRow.id)).where(*chosen).group_by(JobRow.spec_sha256)
     query = select(JobRow, ResultRow).join(ResultRow, ResultRow.job_id == JobRow.id).where(JobRow.id.in_(newest))
     with store.read() as session:
         entries = [
-            TableEntry(to_job(job), r.means, r.protocol, r.provenance, r.train_seconds, r.gaussians)
+            TableEntry(to_job(job), r.means, r.protocol, r.provenance, r.train_seconds, r.gaussians, r.evaluate_seconds)
             for job, r in session.execute(query)
         ]
-    wanted = [e for e in entries if preset is None or e.job.spec.get("preset") == preset]
-    return sorted(wanted, key=lambda e: (e.job.method, e.job.subject, e.job.spec.get("seed", 0), e.job.id))
+    return sorted(entries, key=lambda e: (e.job.method, e.job.subject, e.job.spec.get("seed", 0), e.job.id))

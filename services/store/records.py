@@ -119,6 +119,9 @@ class Filters:
     subject: str | None = None
     grid: str | None = None
     query: str | None = None  # in the language of services.store.query
+    preset: str | None = None
+    tag: str | None = None
+    seeds: Sequence[int] = ()
 
 
 @dataclass(frozen=True)
@@ -240,6 +243,7 @@ class TableEntry:
     provenance: Mapping[str, Any]
     train_seconds: float
     gaussians: int
+    evaluate_seconds: float | None = None
 
 
 class SubjectState(StrEnum):
