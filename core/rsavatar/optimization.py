@@ -67,7 +67,8 @@ class Settings:
     ssim_weight: float = 0.0
     skip: frozenset[Skip] = frozenset(SKIPS)
     doubt: bool = False
-    doubt_from: float = 0.2  # part of the run after which images that contradict all others are left out
+    doubt_from: float = 0.2  # part of the run after which images that contradict all others are left out,
+    doubt_after: int = DOUBT_AFTER  # and steps
 
     def degree(self, step: int) -> int:
         """Degree of the colours' harmonics at ``step``."""
@@ -79,7 +80,7 @@ class Settings:
 
     def doubts(self, step: int) -> bool:
         """Whether images are judged after ``step``."""
-        return self.doubt and max(self.doubt_from * self.iterations, DOUBT_AFTER) <= step < self.iterations
+        return self.doubt and max(self.doubt_from * self.iterations, self.doubt_after) <= step < self.iterations
 
     def closes_block(self, step: int) -> bool:
         """Whether a block of steps ends at ``step`` (counted from 1)."""
