@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Header, Query, Response
@@ -11,18 +12,20 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from rsavatar.errors import SpecError
 from rsavatar.report.figures import FIGURES, build
-from rsavatar.report.runs import Figure, Run, Wish
+from rsavatar.report.runs import Figure, Run, Wish, of_preset, standard
 from rsavatar.spec import Preset, resolve
 from services.api.deps import Back, Backend
 from services.api.sources import source_of
 from services.errors import NotFoundError
-from services.store import metrics
+from services.store import curves, metrics
 from services.store.records import TableEntry
 
 Format = Literal["png", "svg", "pdf", "json"]
 MIMES = {"png": "image/png", "svg": "image/svg+xml", "pdf": "application/pdf"}
 SANDBOX = "default-src 'none'; style-src 'unsafe-inline'; sandbox"  # an SVG is a document: it may style itself only
 OF_CURVES, OF_SCORES = frozenset({"curves"}), frozenset({"qualitative"})  # figures that need more than means
+
+DRAWN_CURVES, CURVE_POINTS = ("psnr", "loss"), 400
 
 router = APIRouter(prefix="/figures", tags=["figures"])
 
@@ -69,19 +72,24 @@ def figure_of(back: Backend, name: str, wish: Wish) -> Figure:
     Raises:
         SpecError: if ``wish`` names what no run has.
     """
-    entries = metrics.table_entries(back.store, wish.preset)
-    return build(name, runs_of(back, entries, name), wish)
+    runs = [to_run(entry) for entry in metrics.table_entries(back.store, wish.preset)]
+    if name in OF_CURVES:
+        runs = compared(runs, wish)
+        found = curves.of_jobs(back.store, [run.job_id for run in runs], DRAWN_CURVES, CURVE_POINTS)
+        runs = [replace(run, curves=found[run.job_id]) for run in runs]
+    if name in OF_SCORES:
+        runs = [replace(run, scores=scores_of(back, run.job_id)) for run in compared(runs, wish)]
+    return build(name, runs, wish)
 
 
-def runs_of(back: Backend, entries: Sequence[TableEntry], name: str) -> list[Run]:
-    """Stored results in the words of the report; curves and scores only for the figures that show them."""
-    return [to_run(back, entry, name) for entry in entries]
+def compared(runs: Sequence[Run], wish: Wish) -> list[Run]:
+    """The runs that a comparison of methods is made from: for them alone more than means is read."""
+    return standard(of_preset(runs, wish.preset))
 
 
-def to_run(back: Backend, entry: TableEntry, name: str) -> Run:
-    """A stored result as a run."""
+def to_run(entry: TableEntry) -> Run:
+    """A stored result in the words of the report."""
     job, spec = entry.job, entry.job.spec
-    ablation = tuple(flag for flag, is_set in dict(spec.get("ablation") or {}).items() if is_set)
     return Run(
         job_id=job.id,
         method=job.method,
@@ -89,7 +97,7 @@ def to_run(back: Backend, entry: TableEntry, name: str) -> Run:
         seed=int(spec.get("seed", 0)),
         preset=str(spec.get("preset", "")),
         bands=str(spec.get("T") or "K"),
-        ablation=ablation,
+        ablation=tuple(flag for flag, is_set in dict(spec.get("ablation") or {}).items() if is_set),
         is_standard=is_standard(dict(spec)),
         iterations=int(spec.get("iterations", 0)),
         train_seconds=entry.train_seconds,
@@ -97,8 +105,6 @@ def to_run(back: Backend, entry: TableEntry, name: str) -> Run:
         commit=str(entry.provenance.get("commit") or ""),
         data_sha256=str(entry.provenance.get("data_sha256") or ""),
         means=entry.means,
-        curves=metrics.curves(back.store, job.id) if name in OF_CURVES else {},
-        scores=scores_of(back, job.id) if name in OF_SCORES else {},
     )
 
 

@@ -14,12 +14,14 @@ from services.api.layout import PageRoute, page
 from services.api.render import Look
 from services.api.sources import has_source
 from services.api.views import JobDetail
-from services.store import jobs, metrics
-from services.store.records import State
+from services.store import jobs
 
 POLICY = f"{CONTENT_POLICY}; media-src 'self'"  # the turntable
-SHUTTERS = (("global", "Global", "one instant"), ("blur", "Blur", "mean over the readout"),
-            ("rolling", "Rolling", "every row at its own instant"))  # fmt: skip
+SHUTTERS = (
+    ("global", "Global", "all rows at one instant"),
+    ("blur", "Blur", "the mean over the readout"),
+    ("rolling", "Rolling", "every row at its own instant"),
+)
 SHOWN = 448  # pixels of the pictures that the page starts with
 
 router = APIRouter(route_class=PageRoute)
@@ -29,9 +31,8 @@ router = APIRouter(route_class=PageRoute)
 def viewer_page(request: Request, job_id: JobId, back: Back, query: Annotated[Look, Query()]) -> HTMLResponse:
     """The avatar of one job. Without scripts it is a form and three pictures."""
     job = jobs.get(back.store, job_id)
-    look = query.model_copy(update={"size": SHOWN, "background": "black"})
-    shown = look.model_dump(exclude_defaults=True) | {"size": SHOWN}
     base = f"/api/v1/jobs/{job_id}"
+    shown = query.model_dump(exclude_defaults=True, exclude={"background"}) | {"size": SHOWN}
     pictures = [
         {"name": name, "title": title, "words": words, "url": f"{base}/render?{urlencode({**shown, 'shutter': name})}"}
         for name, title, words in SHUTTERS
@@ -39,7 +40,6 @@ def viewer_page(request: Request, job_id: JobId, back: Back, query: Annotated[Lo
     context = {
         "job": JobDetail.of(job),
         "ready": has_source(back, job),
-        "means": metrics.outcome_of(back.store, job_id).means if job.state == State.SUCCEEDED else {},
         "look": query,
         "pictures": pictures,
         "base": base,

@@ -20,8 +20,9 @@ def source_of(back: Backend, job_id: str) -> dict[str, Any]:
         ConflictError: if it has no checkpoint yet.
     """
     job = jobs.get(back.store, job_id)
-    kept = next((file for file in artifacts.of_job(back.store, job_id) if file.name == CHECKPOINT), None)
-    path = back.settings.job_dir(job_id) / "checkpoint.safetensors"
+    trained = job.reused_from or job.id
+    kept = next((file for file in artifacts.of_job(back.store, trained) if file.name == CHECKPOINT), None)
+    path = back.settings.job_dir(trained) / "checkpoint.safetensors"
     if kept is not None:
         _, path = artifacts.find(back.store, kept.sha256)
     if not path.is_file():
