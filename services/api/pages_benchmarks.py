@@ -53,12 +53,12 @@ class Measurement:
 
 @router.get("", response_class=HTMLResponse)
 def benchmarks_page(
-    request: Request, back: Back, commit: Annotated[str | None, Query(pattern=r"^[0-9a-z-]{1,64}$")] = None
+    request: Request, back: Back, commit: Annotated[str | None, Query(pattern=r"^[0-9a-z-]{0,64}$")] = None
 ) -> HTMLResponse:
     """The newest run of every benchmark, or those of a commit; earlier runs show whether something got slower."""
     everything = [*shipped(), *stored(back.store)]
     commits = list(dict.fromkeys(m.commit for m in reversed(everything)))
-    wanted = [m for m in everything if commit is None or m.commit == commit]
+    wanted = [m for m in everything if not commit or m.commit == commit]
     chosen = {m.kind: m for m in wanted}  # the newest of a kind comes last
     rank = {kind: i for i, kind in enumerate(ORDER)}
     shown = sorted(chosen.values(), key=lambda m: (rank.get(m.kind, len(rank)), m.kind))
