@@ -9,29 +9,65 @@ import signal
 import socket
 import subprocess
 import sys
+from functools import cache
+from pathlib import Path
 
 import psutil
 
 PR_SET_PDEATHSIG = 1
-START_TOLERANCE = 0.02  # seconds; the kernel counts a start in hundredths
 
 
 def identity() -> str:
-    """``host:pid:start`` names this process so that others on the host can prove it dead, even if its pid is reused."""
-    return f"{socket.gethostname()}:{os.getpid()}:{psutil.Process().create_time():.2f}"
+    """``place:pid:start`` names this process so that others there can prove it dead, even if its pid is reused."""
+    return f"{place()}:{os.getpid()}:{_start(os.getpid())}"
+
+
+@cache
+def place() -> str:
+    """Where pids mean the same: the host, since its last start, and the name space of its pids."""
+    if sys.platform != "linux":
+        return socket.gethostname()
+    boot = Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
+    return f"{socket.gethostname()}-{boot[:8]}-{Path('/proc/self/ns/pid').stat().st_ino}"
+
+
+def _start(pid: int) -> str:
+    """When a process began, on a clock that nobody sets: ticks since the machine's start.
+
+    Raises:
+        psutil.NoSuchProcess: if there is none.
+    """
+    if sys.platform != "linux":
+        return f"{psutil.Process(pid).create_time():.2f}"
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace")
+    except OSError:
+        raise psutil.NoSuchProcess(pid) from None
+    state, *fields = stat.rpartition(")")[2].split()  # what precedes is the name, which may hold anything
+    if state in {"Z", "X"}:
+        raise psutil.NoSuchProcess(pid)
+    return fields[18]
 
 
 def is_surely_dead(owner: str) -> bool:
-    """Whether ``owner`` (an ``identity``) ran on this host and is gone; False when that cannot be known here."""
-    host, _, rest = owner.rpartition(":")[0].rpartition(":")
-    start = owner.rpartition(":")[2]
-    if host != socket.gethostname() or not rest.isdecimal():
-        return False
+    """Whether ``owner`` (an ``identity``) ran here and is gone; False when that cannot be known here."""
+    return _known(owner) is False
+
+
+def is_alive(owner: str) -> bool:
+    """Whether ``owner`` (an ``identity``) runs here; False when that cannot be known here."""
+    return _known(owner) is True
+
+
+def _known(owner: str) -> bool | None:
+    where, _, rest = owner.partition(":")
+    pid, _, start = rest.partition(":")
+    if where != place() or not pid.isdecimal():
+        return None
     try:
-        process = psutil.Process(int(rest))
-        return process.status() == psutil.STATUS_ZOMBIE or abs(process.create_time() - float(start)) > START_TOLERANCE
+        return _start(int(pid)) == start
     except psutil.NoSuchProcess:
-        return True
+        return False
 
 
 def die_with_parent(signum: int = signal.SIGKILL) -> None:

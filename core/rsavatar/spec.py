@@ -25,6 +25,9 @@ Skip = Literal["body", "nodes", "harmonics", "networks", "settled"]  # what each
 SKIPS: tuple[Skip, ...] = ("body", "nodes", "harmonics", "networks")  # those that a job uses unless told otherwise
 Unknown = Literal["readout", "trigger"]  # of a camera's schedule: rho_c and delta_c
 Bands = Annotated[int, Field(ge=1, le=8192)] | Annotated[str, Field(pattern=r"^([2-9]|[1-9][0-9])?K$|^scanline$")]
+NOT_OF_RESULT = frozenset(
+    {"priority", "memory_limit_mb", "stall_seconds"}
+)  # fields that say how a job runs, not what it finds
 BANDS_WANTED = "an integer from 1 to 8192, K, 2K to 99K, or scanline"
 
 SELECTING_METHODS = frozenset({"rs-avatar", "oracle"})  # methods whose shutter selects rows
@@ -96,6 +99,12 @@ class JobSpec(BaseModel):
     iterations: int = Field(20_000, ge=1, le=1_000_000, description="optimiser steps, one frame of one camera each")
     seed: int = Field(0, ge=0, lt=2**31, description="seed of every random choice")
     priority: int = Field(0, ge=-10, le=10, description="higher runs earlier; does not change the result")
+    memory_limit_mb: int | None = Field(
+        None, ge=64, le=1 << 24, description="memory of the job's process; none = the service's; not of the result"
+    )
+    stall_seconds: float | None = Field(
+        None, gt=0, le=86_400, description="longest rest without progress; none = the service's; not of the result"
+    )
 
     body: str = Field("auto", max_length=1024, description="auto, anny, or a path to an SMPL-format .npz or .pkl")
     motion: Literal["sequence-spline", "frame-spline"] = Field(
@@ -157,8 +166,10 @@ class JobSpec(BaseModel):
         return "scanline" if self.T == "scanline" else int(self.T[:-1] or 1) * source_frames
 
     def sha256(self) -> str:
-        """Content hash of everything that decides the result (``priority`` does not)."""
-        text = json.dumps(self.model_dump(mode="json", exclude={"priority"}), sort_keys=True, separators=(",", ":"))
+        """Content hash of everything that decides the result (``NOT_OF_RESULT`` does not)."""
+        text = json.dumps(
+            self.model_dump(mode="json", exclude=set(NOT_OF_RESULT)), sort_keys=True, separators=(",", ":")
+        )
         return hashlib.sha256(text.encode()).hexdigest()
 
 

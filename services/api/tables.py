@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from rsavatar.report.rows import Row, Settings
 from rsavatar.report.tables import TABLES, render
-from rsavatar.spec import Preset
+from rsavatar.spec import NOT_OF_RESULT, Preset
 from services.api.deps import UUID, Back
 from services.api.labels import Tag
 from services.errors import NotFoundError
@@ -28,7 +28,7 @@ MIMES: dict[str, str] = {
     "tex": "application/x-tex; charset=utf-8",
 }
 OF_THE_SUBJECT = frozenset({"cameras", "frames"})  # in a protocol, but no difference in how numbers are made
-APART = frozenset({"method", "subject", "seed", "preset", "priority", "checkpoint_every"})  # no settings of a line
+APART = frozenset({"method", "subject", "seed", "preset", "checkpoint_every"}) | NOT_OF_RESULT  # no settings of a line
 
 router = APIRouter(prefix="/tables", tags=["tables"])
 

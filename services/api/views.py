@@ -13,7 +13,7 @@ from services.store.records import TERMINAL, Artifact, Job, Outcome, State, Subj
 
 PLAIN = ("id", "state", "method", "subject", "priority", "grid_id", "owner", "reused_from")
 PLAIN += ("attempt", "failures", "max_attempts", "rss_bytes")
-DETAILS = ("spec_sha256", "content_sha256", "forced", "notes", "memory_limit_mb", "stall_seconds", "first_traceback")
+DETAILS = ("spec_sha256", "content_sha256", "forced", "notes", "first_traceback")
 
 
 def instant(seconds: float | None) -> datetime | None:
@@ -105,8 +105,6 @@ class JobDetail(JobView):
     content_sha256: str | None
     forced: bool
     notes: str
-    memory_limit_mb: int | None
-    stall_seconds: float | None
     first_traceback: str | None
 
     @classmethod

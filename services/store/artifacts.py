@@ -1,54 +1,56 @@
-"""Artifacts: bytes under their SHA-256 on disk, names in the database. No path ever comes from outside."""
+"""Artifacts: bytes under their SHA-256 (``blobs``), names in the database. No path ever comes from outside."""
 
 from __future__ import annotations
 
-import hashlib
-import os
 import re
-import secrets
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from sqlalchemy import delete, insert, select
+from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
 from services.errors import NotFoundError
+from services.store.blobs import BLOCK, new_incoming, write_hashed
 from services.store.jobs import get
 from services.store.records import Artifact
 from services.store.session import Store, db_now
-from services.store.tables import ArtifactRow
+from services.store.tables import ArtifactRow, BlobRow
 
-BLOCK = 1 << 20
 SHA256 = re.compile(r"[0-9a-f]{64}")
 MIMES = {".png": "image/png", ".json": "application/json", ".txt": "text/plain", ".csv": "text/csv"}
 OTHER = "application/octet-stream"
 
 
-def path_of(root: Path, sha256: str) -> Path:
-    """Where the bytes with this hash lie: ``root/ab/cdef...``."""
-    return root / sha256[:2] / sha256[2:]
+def keep(store: Store, name: str, source: Path) -> Artifact:
+    """Copy ``source`` under its hash, durably. Its row is there before its bytes are, so that no collection takes them.
 
-
-def keep(root: Path, name: str, source: Path) -> Artifact:
-    """Copy ``source`` under its hash, durably: temporary file, fsync, rename. Known bytes are not written again."""
-    digest = hashlib.sha256()
-    root.mkdir(parents=True, exist_ok=True)
-    temporary = root / f"incoming-{os.getpid()}-{secrets.token_hex(4)}"
-    size = 0
+    Raises:
+        OSError: if it cannot be read or the copy not be written.
+    """
+    incoming = new_incoming(store.artifacts_dir)
     try:
-        with source.open("rb") as reader, temporary.open("xb") as writer:
-            while block := reader.read(BLOCK):
-                digest.update(block)
-                writer.write(block)
-                size += len(block)
-            writer.flush()
-            os.fsync(writer.fileno())
-        target = path_of(root, digest.hexdigest())
-        target.parent.mkdir(exist_ok=True)
-        temporary.replace(target)
+        sha256, size = write_hashed(incoming, _blocks(source))
+        with store.write() as session:
+            note(session, sha256, size)
+        store.blobs.keep(sha256, incoming)
     finally:
-        temporary.unlink(missing_ok=True)
-    return Artifact(name, digest.hexdigest(), MIMES.get(source.suffix.lower(), OTHER), size)
+        incoming.unlink(missing_ok=True)
+    return Artifact(name, sha256, MIMES.get(source.suffix.lower(), OTHER), size)
+
+
+def note(session: Session, sha256: str, size: int) -> None:
+    """Bytes of this hash are about to be used: they stay for a while even if nothing names them."""
+    dialect: Any = postgresql if session.get_bind().dialect.name == "postgresql" else sqlite
+    statement = dialect.insert(BlobRow).values(sha256=sha256, size=size, created_at=db_now(), used_at=db_now())
+    session.execute(statement.on_conflict_do_update(index_elements=[BlobRow.sha256], set_={"used_at": db_now()}))
+
+
+def _blocks(source: Path) -> Iterator[bytes]:
+    with source.open("rb") as reader:
+        while block := reader.read(BLOCK):
+            yield block
 
 
 def put(session: Session, job_id: str, artifacts: Sequence[Artifact]) -> None:
@@ -83,7 +85,7 @@ def find(store: Store, sha256: str) -> tuple[Artifact, Path]:
     if SHA256.fullmatch(sha256):
         with store.read() as session:
             row = session.scalar(select(ArtifactRow).where(ArtifactRow.sha256 == sha256).limit(1))
-    path = path_of(store.artifacts_dir, sha256)
-    if row is None or not path.is_file():
+    path = None if row is None else store.blobs.path(sha256)
+    if row is None or path is None:
         raise NotFoundError("artifact", "the sha256 of a stored file", sha256)
     return Artifact(row.name, row.sha256, row.mime, row.size), path

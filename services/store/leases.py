@@ -70,7 +70,7 @@ def _take(session: Session, row: JobRow, owner: str, lease_seconds: float) -> Cl
     if taken is None:
         return None
     events.append(session, row.id, [events.state_event(State.RUNNING, attempt=taken)])
-    return Claim(row.id, taken, row.spec, row.subject, row.memory_limit_mb, row.stall_seconds)
+    return Claim(row.id, taken, row.spec, row.subject)
 
 
 def beat(store: Store, claim: Claim, batch: Batch, lease_seconds: float) -> Orders:
@@ -227,10 +227,11 @@ def unclaimed(store: Store, seconds: float, limit: int) -> list[str]:
         return list(session.scalars(query.order_by(JobRow.priority.desc(), JobRow.id).limit(limit)))
 
 
-def take_duty(store: Store, name: str, owner: str, seconds: float) -> bool:
-    """Take or renew a duty that one process at a time has. False: another has it."""
+def take_duty(store: Store, name: str, owner: str, seconds: float, *, renew: bool = True) -> bool:
+    """Take a duty that one process at a time has, or renew one's own. False: somebody has it."""
     with store.write() as session:
-        free = (SchedulerRow.owner == owner) | (SchedulerRow.until < db_now())
+        over = SchedulerRow.until < db_now()
+        free = (SchedulerRow.owner == owner) | over if renew else over
         values = {"owner": owner, "until": db_now() + seconds}
         renewed = update(SchedulerRow).where(SchedulerRow.name == name, free).values(**values)
         if session.scalar(renewed.returning(SchedulerRow.name)) is not None:

@@ -65,8 +65,6 @@ class Job:
     attempt: int
     failures: int
     max_attempts: int
-    memory_limit_mb: int | None
-    stall_seconds: float | None
     lease_owner: str | None
     lease_until: float | None
     not_before: float
@@ -106,8 +104,6 @@ class Submission:
     notes: str = ""
     content_sha256: str | None = None
     forced: bool = False
-    memory_limit_mb: int | None = None
-    stall_seconds: float | None = None
 
 
 @dataclass(frozen=True)
@@ -132,8 +128,6 @@ class Claim:
     attempt: int
     spec: Mapping[str, Any]
     subject: str
-    memory_limit_mb: int | None = None
-    stall_seconds: float | None = None
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ from typing import Any
 
 from sqlalchemy import Connection, Double, Engine, create_engine, event, select
 from sqlalchemy.engine.interfaces import DBAPIConnection
-from sqlalchemy.exc import ArgumentError
+from sqlalchemy.exc import ArgumentError, InterfaceError, OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.orm import Session
 from sqlalchemy.pool import ConnectionPoolEntry
@@ -18,7 +19,10 @@ from sqlalchemy.sql.functions import FunctionElement
 
 from services.errors import SettingsError
 from services.settings import Settings
+from services.store.blobs import open_blobs
 
+OUTAGES = (OperationalError, InterfaceError, PoolTimeoutError)  # of a database that may come back
+CONNECT_SECONDS = 5
 PRAGMAS = ("journal_mode=WAL", "foreign_keys=ON", "synchronous=NORMAL", "busy_timeout=60000", "cache_size=-20000")
 
 
@@ -57,7 +61,8 @@ class Store:
 
     def __init__(self, settings: Settings) -> None:
         self.engine = open_engine(settings.database)
-        self.artifacts_dir: Path = settings.home / "artifacts"
+        self.blobs = open_blobs(settings)
+        self.artifacts_dir: Path = self.blobs.root
         self.quota = Quota(settings.max_queued_per_owner, settings.max_running_per_owner)
         self._writer = self.engine.execution_options(immediate=True)
 
@@ -90,7 +95,10 @@ def open_engine(url: str) -> Engine:
         SettingsError: if ``url`` is not a database URL, or its driver is not installed.
     """
     try:
-        engine = create_engine(url, pool_pre_ping=not url.startswith("sqlite"))
+        if url.startswith("sqlite"):
+            engine = create_engine(url)
+        else:
+            engine = create_engine(url, pool_pre_ping=True, connect_args={"connect_timeout": CONNECT_SECONDS})
     except (ArgumentError, ModuleNotFoundError) as error:
         wanted = "sqlite:///PATH or postgresql+psycopg://... with psycopg installed"
         raise SettingsError("RSAVATAR_DATABASE_URL", wanted, error) from None

@@ -72,8 +72,6 @@ class JobRow(Base):
     attempt: Mapped[int] = mapped_column(default=0)
     failures: Mapped[int] = mapped_column(default=0)
     max_attempts: Mapped[int]
-    memory_limit_mb: Mapped[int | None]  # none: the settings'
-    stall_seconds: Mapped[float | None]  # none: the settings'
     lease_owner: Mapped[str | None] = mapped_column(String(255))
     lease_until: Mapped[float | None]
     not_before: Mapped[float] = mapped_column(default=0.0)

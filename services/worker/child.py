@@ -11,6 +11,7 @@ two processes never write one checkpoint. A lock on the folder makes sure of it.
 
 from __future__ import annotations
 
+import faulthandler
 import fcntl
 import json
 import os
@@ -27,7 +28,7 @@ from typing import IO, Any, Protocol
 
 from rsavatar import errors, events
 from rsavatar.spec import JobSpec
-from services.process import die_with_parent
+from services.process import die_with_parent, identity
 
 LOCK_SECONDS = 10.0  # an orphan of an earlier attempt has this long to disappear
 BAD_DATA = (errors.DataError, errors.BodyError, errors.SpecError)
@@ -38,6 +39,9 @@ CLASSES: tuple[tuple[type[BaseException] | tuple[type[BaseException], ...], str]
     (BlockingIOError, "infrastructure"),
     (OSError, "infrastructure"),
 )
+
+
+NO_MEMORY = ("can't allocate memory", "Insufficient memory", "bad_alloc", "Cannot allocate memory")  # torch, cv2, ours
 
 
 class Result(Protocol):
@@ -99,6 +103,8 @@ class Channel:
 def serve(run: Run) -> int:
     """Run the job on stdin and return the exit status."""
     die_with_parent()
+    faulthandler.enable()  # a crash of native code says where, in the log
+    faulthandler.register(signal.SIGUSR1, all_threads=True)  # so does a job that hangs, when asked
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole terminal; the worker decides
@@ -130,7 +136,7 @@ def serve(run: Run) -> int:
 def describe(error: Exception) -> dict[str, Any]:
     """The ``failed`` message of an exception; what is not known by its class is a bug of ours."""
     failure = next((name for kind, name in CLASSES if isinstance(error, kind)), "bug")
-    if isinstance(error, RuntimeError) and "can't allocate memory" in str(error):  # torch has no class for it
+    if failure in {"bug", "infrastructure"} and any(word in str(error) for word in NO_MEMORY):
         failure = "out of memory"
     text = "".join(traceback.format_exception(error))
     return {"kind": "failed", "failure": failure, "message": f"{type(error).__name__}: {error}", "traceback": text}
@@ -142,17 +148,20 @@ def _die_at_end_of_input() -> None:
 
 
 def _only_writer(out: Path) -> IO[str]:
-    """Lock ``out`` for this process.
+    """Lock ``out`` for this process, and say in the lock whose it is.
 
     Raises:
         BlockingIOError: if another process still writes there.
     """
     out.mkdir(parents=True, exist_ok=True)
-    lock = (out / ".lock").open("w", encoding="utf-8")
+    lock = (out / ".lock").open("a+", encoding="utf-8")
     deadline = time.monotonic() + LOCK_SECONDS
     while True:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock.truncate(0)
+            lock.write(identity())  # so that a successor on this machine can end us
+            lock.flush()
             return lock
         except BlockingIOError:
             if time.monotonic() > deadline:

@@ -7,9 +7,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from services.store import artifacts
-from services.store.records import Artifact, Batch, Event, Look, Point, fraction_of
+from services.store.records import Artifact, Batch, Checkpoint, Event, Look, Point, fraction_of
+from services.store.session import OUTAGES
 
+Keep = Callable[[str, Path], Artifact]  # stores a file under a name
 CURVES = ("loss", "psnr", "gaussians")
 
 
@@ -20,12 +21,13 @@ class Reporter:
     itself does not move.
     """
 
-    def __init__(self, artifacts_dir: Path, clock: Callable[[], float] = time.monotonic) -> None:
-        self._artifacts_dir = artifacts_dir
+    def __init__(self, keep: Keep, clock: Callable[[], float] = time.monotonic) -> None:
+        self._keep = keep
         self._clock = clock
         self._events: list[Event] = []
         self._files: list[Artifact] = []
         self._look: Look | None = None
+        self._checkpoint: Checkpoint | None = None
         self._place: tuple[str, int] = ("", -1)
         self.moved_at = clock()
         self.last_checkpoint: int | None = None
@@ -41,7 +43,7 @@ class Reporter:
         if kind == "preview":
             kind, payload = self._preview(payload)
         elif kind == "checkpointed":
-            self.last_checkpoint = int(payload["step"])
+            self._take_checkpoint(payload)
             payload.pop("path")  # a path of this machine means nothing to readers
         self._events.append(Event(kind, payload))
 
@@ -56,23 +58,38 @@ class Reporter:
     def _preview(self, payload: dict[str, Any]) -> tuple[str, dict[str, Any]]:
         name = f"preview/{int(payload['step']):08d}-{Path(payload['path']).name}"
         try:
-            file = artifacts.keep(self._artifacts_dir, name, Path(payload["path"]))
-        except OSError as error:  # a picture is not worth a job
+            file = self._keep(name, Path(payload["path"]))
+        except (OSError, *OUTAGES) as error:  # a picture is not worth a job
             return "note", {"text": f"preview lost: {error}"}
         self._files.append(file)
         return "preview", {"step": payload["step"], "caption": payload["caption"], "sha256": file.sha256}
 
-    def flush(self) -> Batch:
+    def _take_checkpoint(self, payload: Mapping[str, Any]) -> None:
+        """Store a copy that other machines can go on from. One that is replaced while it is read is no copy."""
+        self.last_checkpoint = int(payload["step"])
+        try:
+            file = self._keep("checkpoint", Path(payload["path"]))
+        except (OSError, *OUTAGES) as error:  # the file on this machine's disk is as good
+            self._events.append(Event("note", {"text": f"checkpoint of step {payload['step']} not stored: {error}"}))
+            return
+        if file.sha256 == payload["sha256"]:
+            self._checkpoint = Checkpoint(self.last_checkpoint, file.sha256, file.size)
+
+    def note(self, text: str) -> None:
+        """A sentence of the worker's own."""
+        self._events.append(Event("note", {"text": text}))
+
+    def flush(self, rss_bytes: int | None = None) -> Batch:
         """Everything since the last flush."""
-        events, files, look = self._events, self._files, self._look
-        self._events, self._files, self._look = [], [], None
+        events, files, look, checkpoint = self._events, self._files, self._look, self._checkpoint
+        self._events, self._files, self._look, self._checkpoint = [], [], None, None
         points: list[Point] = []
         if look is not None:
             events.append(Event("progress", _fields(look)))
             if look.stage == "train":
                 found = {key: getattr(look, key) for key in CURVES}
                 points = [Point(key, look.step, float(value)) for key, value in found.items() if value is not None]
-        return Batch(events, points, files, look)
+        return Batch(events, points, files, look, rss_bytes, checkpoint)
 
 
 def _fields(look: Look) -> dict[str, Any]:

@@ -16,10 +16,10 @@ from sqlalchemy.exc import SQLAlchemyError
 from services import jobs
 from services.process import is_surely_dead
 from services.settings import Settings
-from services.store import leases
+from services.store import garbage, leases, stages
 from services.store.session import Store
 
-DUTY = "sweep"
+DUTY, COLLECTION = "sweep", "gc"
 MOST_WAKE_UPS = 100  # in one round
 
 log = logging.getLogger(__name__)
@@ -43,6 +43,18 @@ def sweep(settings: Settings, store: Store, app: Celery, owner: str) -> None:
     wake(settings, store, app)
 
 
+def collect(settings: Settings, store: Store, owner: str) -> None:
+    """Remove unnamed bytes, if no worker has for ``gc_hours``: the duty is kept until the next time."""
+    if not settings.gc_hours or not leases.take_duty(store, COLLECTION, owner, 3600.0 * settings.gc_hours, renew=False):
+        return
+    found = garbage.collect(store, settings.home / "jobs", settings.gc_grace_seconds, dry_run=False)
+    stages.collect(store, 24 * 3600.0 * settings.stage_days, dry_run=False)
+    if found.blobs:
+        log.info("removed %d blobs that nothing names, %.1f MB", found.blobs, found.bytes / 2**20)
+    for sha256 in found.missing:
+        log.warning("the bytes of artifact %s are gone", sha256)
+
+
 def wake(settings: Settings, store: Store, app: Celery) -> None:
     """Send as many wake-ups as jobs wait beyond those that the broker holds: their number stays bounded."""
     waiting = leases.unclaimed(store, settings.unclaimed_seconds, MOST_WAKE_UPS)
@@ -63,6 +75,7 @@ def sweep_until(stopping: threading.Event, settings: Settings, store: Store, app
         try:
             alive_file(settings).touch()
             sweep(settings, store, app, owner)
+            collect(settings, store, owner)
         except (SQLAlchemyError, OSError) as error:  # the database or disk may come back; the next round will see
             log.warning("sweep put off: %s", error)
         if stopping.wait(settings.sweep_seconds):

@@ -135,7 +135,7 @@ def test_artifacts_are_served_as_they_are_and_run_nowhere(client: httpx.Client, 
     kept = []
     for name, data in (("page.html", b"<script>"), ("view.png", b"\x89PNG")):
         (tmp_path / name).write_bytes(data)
-        kept.append(artifacts.keep(store.artifacts_dir, name, tmp_path / name))
+        kept.append(artifacts.keep(store, name, tmp_path / name))
     leases.beat(store, claim, Batch(artifacts=kept), 60.0)
     page, view = (client.get(a["url"]) for a in client.get(f"/api/v1/jobs/{job}/artifacts").json())
     assert (page.content, page.headers["content-type"]) == (b"<script>", "application/octet-stream")
@@ -147,7 +147,7 @@ def test_artifacts_are_served_as_they_are_and_run_nowhere(client: httpx.Client, 
         assert "immutable" in reply.headers["cache-control"]
     assert client.get(f"/api/v1/artifacts/{'0' * 64}").status_code == 404
     assert client.get("/api/v1/artifacts/..%2f..%2frsavatar.db").status_code in {404, 422}
-    artifacts.path_of(store.artifacts_dir, kept[0].sha256).unlink()
+    store.blobs.remove(kept[0].sha256)
     assert client.get(f"/api/v1/artifacts/{kept[0].sha256}").status_code == 404
 
 

@@ -1,13 +1,18 @@
 from __future__ import annotations
 
+import hashlib
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from rsavatar import errors
+from services.store import artifacts
+from services.store.records import Checkpoint
+from services.store.session import Store
 from services.worker.child import describe
+from services.worker.launch import child_environment, describe_death
 from services.worker.reporter import Reporter
-from services.worker.supervisor import child_environment, describe_death
 from tests.services.conftest import Settings
 
 
@@ -23,8 +28,8 @@ def progress(step: int, stage: str = "train", **more: object) -> dict[str, objec
     return {"kind": "progress", "stage": stage, "step": step, "steps": 100, "seconds": 1.0, "eta_seconds": 9.0, **more}
 
 
-def test_a_fast_job_costs_one_look_and_one_point_a_heartbeat(tmp_path: Path) -> None:
-    reporter = Reporter(tmp_path)
+def test_a_fast_job_costs_one_look_and_one_point_a_heartbeat(store: Store) -> None:
+    reporter = Reporter(partial(artifacts.keep, store))
     for step in range(1, 51):
         reporter.take(progress(step, loss=1.0 / step, gaussians=step))
     batch = reporter.flush()
@@ -35,9 +40,9 @@ def test_a_fast_job_costs_one_look_and_one_point_a_heartbeat(tmp_path: Path) -> 
     assert reporter.flush() == type(batch)([], [], [], None)
 
 
-def test_only_getting_somewhere_counts_as_movement(tmp_path: Path) -> None:
+def test_only_getting_somewhere_counts_as_movement(store: Store) -> None:
     clock = Clock()
-    reporter = Reporter(tmp_path, clock)
+    reporter = Reporter(partial(artifacts.keep, store), clock)
     for now, message, moved in (
         (1.0, progress(1), 1.0),
         (2.0, progress(1), 1.0),
@@ -50,8 +55,23 @@ def test_only_getting_somewhere_counts_as_movement(tmp_path: Path) -> None:
         assert reporter.moved_at == moved
 
 
-def test_a_lost_picture_does_not_cost_the_job(tmp_path: Path) -> None:
-    reporter = Reporter(tmp_path / "artifacts")
+def test_a_checkpoint_is_stored_unless_it_is_another_by_now(store: Store, tmp_path: Path) -> None:
+    reporter = Reporter(partial(artifacts.keep, store))
+    file = tmp_path / "checkpoint.safetensors"
+    file.write_bytes(b"state")
+    sha256 = hashlib.sha256(b"state").hexdigest()
+    told = {"kind": "checkpointed", "step": 5, "path": str(file), "sha256": sha256}
+    reporter.take(told)
+    assert reporter.flush().checkpoint == Checkpoint(5, sha256, 5)
+    reporter.take({**told, "sha256": "0" * 64})
+    reporter.take({**told, "path": str(tmp_path / "none")})
+    batch = reporter.flush()
+    assert batch.checkpoint is None
+    assert [e.kind for e in batch.events] == ["checkpointed", "note", "checkpointed"]
+
+
+def test_a_lost_picture_does_not_cost_the_job(store: Store, tmp_path: Path) -> None:
+    reporter = Reporter(partial(artifacts.keep, store))
     reporter.take({"kind": "preview", "step": 1, "path": str(tmp_path / "none.png"), "caption": "x"})
     (tmp_path / "one.png").write_bytes(b"png")
     reporter.take({"kind": "preview", "step": 2, "path": str(tmp_path / "one.png"), "caption": "x"})

@@ -164,8 +164,8 @@ def test_artifacts_lie_under_their_hash(store: Store, tmp_path: Path) -> None:
     file = tmp_path / "picture.png"
     file.write_bytes(b"bytes")
     job = submit(store)
-    first = artifacts.keep(store.artifacts_dir, "a", file)
-    assert artifacts.keep(store.artifacts_dir, "b", file).sha256 == first.sha256
+    first = artifacts.keep(store, "a", file)
+    assert artifacts.keep(store, "b", file).sha256 == first.sha256
     leases.beat(store, take(store), Batch(artifacts=[first, first]), 60.0)
     found, path = artifacts.find(store, first.sha256)
     assert (found, path.read_bytes()) == (first, b"bytes")

@@ -31,7 +31,7 @@ QUICK: dict[str, Any] = {  # the service's protocol in fractions of a second
     "unclaimed_seconds": 0.5,
     "backoff_seconds": 0.0,
     "grace_seconds": 5.0,
-    "stall_seconds": 2.0,
+    "stall_seconds": 30.0,
     "poll_seconds": 0.05,
     "child_command": (sys.executable, "-m", "tests.system.quick_child"),
 }
@@ -112,7 +112,7 @@ class Host:
     def submit(self, **changes: Any) -> str:
         """Submit a job over HTTP and return its id."""
         spec = {"method": "gauhuman", "subject": "studio", "preset": "smoke", "iterations": 60, "checkpoint_every": 10}
-        reply = self.client.post("/api/v1/jobs", json={**spec, **changes})
+        reply = self.client.post("/api/v1/jobs", params={"force": True}, json={**spec, **changes})
         assert reply.status_code == 202, reply.text
         return str(reply.json()["id"])
 

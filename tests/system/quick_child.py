@@ -50,11 +50,17 @@ def misbehave(spec: JobSpec, out: Path, step: int) -> None:
         time.sleep(600)
 
 
+def newest(*checkpoints: Path) -> tuple[int, str]:
+    found = [json.loads(path.read_text()) for path in checkpoints if path.exists()]
+    step, state = max(found, default=(0, "start"))
+    return step, state
+
+
 def count(
     spec: JobSpec, out: Path, subject_dir: Path | None, report: events.Report, should_stop: Callable[[], bool]
 ) -> Count:
     checkpoint = out / "checkpoint.json"
-    step, state = json.loads(checkpoint.read_text()) if checkpoint.exists() else (0, "start")
+    step, state = newest(checkpoint, out / "checkpoint.stored")
     print("a stray print must not break the protocol")
     report(events.Note(f"starting at step {step}"))
     started = time.monotonic()
@@ -67,7 +73,7 @@ def count(
             partial = out / "checkpoint.part"
             partial.write_text(json.dumps([step, state]))
             partial.replace(checkpoint)
-            report(events.Checkpointed(step, str(checkpoint), state))
+            report(events.Checkpointed(step, str(checkpoint), hashlib.sha256(checkpoint.read_bytes()).hexdigest()))
         if should_stop():
             raise errors.Interrupted("asked to stop")
     return finish(spec, out, state, report)

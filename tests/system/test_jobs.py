@@ -62,7 +62,7 @@ def test_failures_end_as_their_kind_says(
 
 
 def test_a_job_that_hangs_is_killed(host: Host) -> None:
-    job = host.submit(seed=HANGS, iterations=10)
+    job = host.submit(seed=HANGS, iterations=10, stall_seconds=2.0)
     view = until(lambda: v if (v := host.job(job))["failures"] else {})
     assert "no progress in 2 s" in view["error"]["message"]
     host.client.post(f"/api/v1/jobs/{job}/cancel")

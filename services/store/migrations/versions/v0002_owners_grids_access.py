@@ -15,8 +15,6 @@ NEW_TABLES = ("audit", "benchmarks", "blobs", "checkpoints", "grids", "job_tags"
 NEW_OF_JOBS = (
     "rss_bytes",
     "first_traceback",
-    "stall_seconds",
-    "memory_limit_mb",
     "reused_from",
     "forced",
     "content_sha256",
@@ -170,8 +168,6 @@ def upgrade() -> None:
         batch_op.add_column(sa.Column("content_sha256", sa.String(length=64), nullable=True))
         batch_op.add_column(sa.Column("forced", sa.Boolean(), server_default=sa.false(), nullable=False))
         batch_op.add_column(sa.Column("reused_from", sa.String(length=36), nullable=True))
-        batch_op.add_column(sa.Column("memory_limit_mb", sa.Integer(), nullable=True))
-        batch_op.add_column(sa.Column("stall_seconds", sa.Double(), nullable=True))
         batch_op.add_column(sa.Column("first_traceback", sa.Text(), nullable=True))
         batch_op.add_column(sa.Column("rss_bytes", sa.BigInteger(), nullable=True))
         batch_op.drop_index(batch_op.f("ix_jobs_grid_id"))
