@@ -47,6 +47,23 @@ examples:
 
 Prints the job's id. SPEC and --set are those of `rsavatar run`.
 """
+GRID = """\
+A grid varies a base request along axes. Without GRID, lists the built-in grids and the service's newest. A list after
+--set makes an axis. A file looks like those in core/experiments/grids:
+
+  [base]
+  preset = "draft"
+  method = "rs-avatar"
+  [axes]
+  subject = ["sword", "walk"]
+  ablation = ["full", "no_rs", "no_spline"]
+
+examples:
+  rsavatar grid ablation --subjects sword --set preset=draft --dry-run
+  rsavatar grid ablation --subjects sword --set preset=draft --watch
+  rsavatar grid main --subjects sword,walk,wave --set seed=[0,1,2]
+  rsavatar table ablation --grid ID --format tex
+"""
 CHECK = """\
 Reads files, cameras, timing and masks, projects the fitted body into sampled masks, and names the usual mistakes:
 metres for millimetres, Rh taken for global_orient, files that are missing. Exit status 1 when unfit.
@@ -75,6 +92,23 @@ Prints the token, which is shown this once. `submit` covers `read`, and `admin` 
 examples:
   rsavatar token create laptop --owner ann
   rsavatar token create dashboards --owner monitoring --scope read --days 0
+"""
+FIGURE = """\
+The service draws it from its database and its avatars; the file's ending says the format.
+
+examples:
+  rsavatar figure per-subject --out per-subject.pdf
+  rsavatar figure qualitative --subject walk --camera 07 --frame 5 --out walk.png
+  rsavatar figure curves --out curves.json                     the numbers, and the jobs they come from
+"""
+EXPORT = """\
+The file's ending says what it is to be: .ply is the Gaussians (canonical, or posed with --time) in the layout of 3D
+Gaussian splatting, .png and .webp a view, .mp4, .webm and .gif a turntable.
+
+examples:
+  rsavatar export runs/studio-rs-avatar-1a2b3c4d --out avatar.ply
+  rsavatar export ID --time 3.5 --shutter rolling --azimuth 30 --out view.png
+  rsavatar export ID --out turntable.mp4
 """
 WATCH = (
     "Follows a job's progress and prints its results. A broken connection is taken up again. Ctrl-C only stops looking."
@@ -162,19 +196,63 @@ def _add_remote(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     jobs = _add(verbs, "jobs", "rsavatar.cli_remote:jobs", "list jobs, newest first")
     for name in ("state", "method", "subject"):
         jobs.add_argument(f"--{name}")
+    jobs.add_argument("-q", metavar="FILTER", help="such as 'state:failed,dead psnr>25 (tag:paper or created<2d)'")
+    jobs.add_argument("--sort", metavar="KEY", help="submitted, psnr, seconds, ...; with - before it, largest first")
     jobs.add_argument("--limit", type=int, default=50, metavar="N", help="at most N jobs (default: 50)")
 
     table = _add(verbs, "table", "rsavatar.cli_remote:table", "print a table of results")
-    table.add_argument("name", help="main or per-subject")
+    table.add_argument("name", metavar="NAME", help="main, ablation, per-subject, shutter or cost")
     table.add_argument("--format", choices=["json", "csv", "md", "tex"], default="md", help="default: md")
+    table.add_argument("--grid", metavar="ID", help="of the jobs of one grid")
+    table.add_argument("--preset", help="of the jobs of one preset")
+    table.add_argument("--tag", help="of the jobs with one tag")
+    table.add_argument("--seed", action="append", metavar="N", help="of the jobs with one seed; repeatable")
+    table.add_argument("-q", metavar="FILTER", help="of the jobs that a filter finds, as of `rsavatar jobs -q`")
 
     subjects = _add(verbs, "subjects", "rsavatar.cli_remote:subjects", "list subjects, or make one known")
     subjects.add_argument("--add", nargs=2, metavar=("NAME", "PATH"), help="a folder on the service's machine")
     subjects.add_argument("--upload", nargs=2, metavar=("NAME", "FILE"), help="a .zip or .tar.gz of yours")
     subjects.add_argument("--remove", metavar="NAME", help="forget a subject; an uploaded one's files are removed")
-    access = _add_access(verbs)
+    access = (*_add_access(verbs), *_add_pictures(verbs), _add_grid(verbs))
     for parser in (submit, jobs, table, subjects, *access, *(verbs.choices[n] for n in ("watch", "cancel", "retry"))):
         parser.add_argument("--url", help="the service (default: $RSAVATAR_URL, else http://127.0.0.1:8000)")
+
+
+def _add_pictures(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> list[argparse.ArgumentParser]:
+    figure = _add(verbs, "figure", "rsavatar.cli_pictures:figure", "draw a figure of the results", FIGURE)
+    figure.add_argument("name", metavar="NAME", help="qualitative, per-subject, shutter, pareto, curves or ablation")
+    figure.add_argument("--out", type=Path, required=True, metavar="FILE", help="NAME.png, .svg, .pdf or .json")
+    figure.add_argument("--preset", help="of the jobs of one preset (default: the one that most jobs have)")
+    for name in ("subject", "camera"):
+        figure.add_argument(f"--{name}", help=f"the {name} that is shown")
+    figure.add_argument("--frame", type=int, metavar="N", help="the frame that is shown")
+
+    export = _add(verbs, "export", "rsavatar.cli_pictures:export", "take an avatar out: Gaussians, view, video", EXPORT)
+    export.add_argument("source", metavar="ID|RUN", help="the id of a job, or a folder that `rsavatar run` wrote")
+    export.add_argument("--out", type=Path, required=True, metavar="FILE", help=".ply, .png, .webp, .mp4, .webm, .gif")
+    export.add_argument("--subject-dir", type=Path, metavar="DIR", help="of a RUN: the subject's folder")
+    export.add_argument("--camera", help="a camera of the subject (default: one in front of the body)")
+    export.add_argument("--shutter", help="global, blur, rolling, or bands:T")
+    for name, about in (("time", "output frames"), ("readout", "source frames")):
+        export.add_argument(f"--{name}", type=float, metavar="T", help=about)
+    for name in ("azimuth", "elevation"):
+        export.add_argument(f"--{name}", type=float, metavar="DEGREES")
+    export.add_argument("--size", type=int, metavar="N", help="pixels of the longer side")
+    return [figure, export]
+
+
+def _add_grid(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.ArgumentParser:
+    grid = _add(verbs, "grid", "rsavatar.cli_grid:grid", "queue, follow or list grids of jobs", GRID)
+    grid.add_argument("name", metavar="GRID", nargs="?", help="a built-in grid, a TOML file, or the id of a grid")
+    grid.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a word of all jobs, or an axis")
+    grid.add_argument("--subjects", metavar="A,B", help="on these subjects")
+    grid.add_argument("--dry-run", action="store_true", help="how many jobs, how long; queue nothing")
+    grid.add_argument("--key", help="idempotency key (default: a fresh one)")
+    grid.add_argument("--watch", action="store_true", help="stay and follow it")
+    verb = grid.add_mutually_exclusive_group()
+    for name, about in (("cancel", "stop"), ("pause", "hold"), ("resume", "go on with"), ("retry", "queue again")):
+        verb.add_argument(f"--{name}", action="store_true", help=f"{about} the jobs of the grid with this id")
+    return grid
 
 
 def _add_access(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> list[argparse.ArgumentParser]:

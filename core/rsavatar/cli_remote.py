@@ -30,7 +30,7 @@ def watch(arguments: argparse.Namespace) -> int:
 
 def jobs(arguments: argparse.Namespace) -> int:
     """``rsavatar jobs``: a line per job, newest first."""
-    filters = {k: v for k in ("state", "method", "subject") if (v := getattr(arguments, k)) is not None}
+    filters = {k: v for k in ("state", "method", "subject", "q", "sort") if (v := getattr(arguments, k)) is not None}
     filters["limit"] = str(max(1, min(arguments.limit, 200)))
     with Client(arguments.url) as client:
         for job in itertools.islice(client.jobs(**filters), arguments.limit):
@@ -41,7 +41,9 @@ def jobs(arguments: argparse.Namespace) -> int:
 def table(arguments: argparse.Namespace) -> int:
     """``rsavatar table``: a table of results, as the service renders it."""
     with Client(arguments.url) as client:
-        sys.stdout.write(client.table(arguments.name, arguments.format))
+        named = {name: getattr(arguments, name) for name in ("grid", "preset", "tag", "seed", "q")}
+        filters = {name: value for name, value in named.items() if value}
+        sys.stdout.write(client.table(arguments.name, arguments.format, **filters))
     return 0
 
 

@@ -24,6 +24,7 @@ URL_VARIABLE = "RSAVATAR_URL"
 TERMINAL = frozenset({"succeeded", "failed", "dead", "cancelled"})  # states that a job leaves only by a retry
 SILENCE_SECONDS = 60.0  # an event stream says at least a comment more often than this
 PATIENCE_SECONDS = 120.0  # how long ``events`` looks for a service that went away
+DRAWING_SECONDS = 300.0  # the first drawing starts a process and opens the subject; a video takes longer still
 PAUSE_SECONDS = 1.0  # between two looks, unless the stream asked for another pause
 
 Json = dict[str, Any]
@@ -104,9 +105,53 @@ class Client:
         results: Json = self._json("GET", _path("jobs", job_id, "results"))
         return results
 
-    def table(self, name: str, fmt: str = "md") -> str:
-        """A result table as text in json, csv, md or tex."""
-        return self._request("GET", _path("tables", f"{name}.{fmt}")).text
+    def table(self, name: str, fmt: str = "md", **filters: str | list[str]) -> str:
+        """A result table as text in json, csv, md or tex; ``filters`` are grid, preset, tag, seed, q."""
+        return self._request("GET", _path("tables", f"{name}.{fmt}"), params=filters).text
+
+    def figure(self, name: str, fmt: str = "pdf", **choices: Any) -> bytes:
+        """A figure's file in png, svg, pdf or json; ``choices`` are preset, subject, camera, frame."""
+        return self._request("GET", _path("figures", f"{name}.{fmt}"), params=choices, timeout=DRAWING_SECONDS).content
+
+    def view(self, job_id: str, **look: Any) -> bytes:
+        """A picture of a job's avatar; ``look`` is camera, time, shutter, readout, azimuth, elevation, size, format."""
+        return self._request("GET", _path("jobs", job_id, "render"), params=look, timeout=DRAWING_SECONDS).content
+
+    def export(self, job_id: str, kind: str, **options: Any) -> bytes:
+        """A file of a job's avatar: ``ply`` or ``turntable``."""
+        place = _path("jobs", job_id, "export", kind)
+        return self._request("GET", place, params=options, timeout=DRAWING_SECONDS).content
+
+    def submit_grid(self, request: Mapping[str, Any], idempotency_key: str | None = None) -> Json:
+        """Queue all jobs of a grid; the same key and request give the same grid. Returns the grid."""
+        headers = {"Idempotency-Key": idempotency_key or str(uuid.uuid4())}
+        found: Json = self._json("POST", "/grids", json=dict(request), headers=headers)
+        return found
+
+    def plan_grid(self, request: Mapping[str, Any]) -> Json:
+        """What a grid would do: its jobs, known results, time. Nothing is queued."""
+        plan: Json = self._json("POST", "/grids", json=dict(request), params={"dry_run": "true"})
+        return plan
+
+    def grid(self, grid_id: str) -> Json:
+        """A grid as it is now, with all its cells."""
+        found: Json = self._json("GET", _path("grids", grid_id))
+        return found
+
+    def grids(self) -> Iterator[Json]:
+        """Grids, newest first, page after page."""
+        parameters: dict[str, str] = {}
+        while True:
+            page = self._json("GET", "/grids", params=parameters)
+            yield from page["items"]
+            if not page.get("next_cursor"):
+                return
+            parameters["cursor"] = page["next_cursor"]
+
+    def steer_grid(self, grid_id: str, verb: str) -> Json:
+        """Cancel, pause, resume or retry all jobs of a grid. Returns the grid."""
+        found: Json = self._json("POST", _path("grids", grid_id, verb))
+        return found
 
     def subjects(self) -> list[Json]:
         """The subjects that jobs may name."""

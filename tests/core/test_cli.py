@@ -22,7 +22,7 @@ from rsavatar.events import Note, Progress, to_json
 from rsavatar.spec import resolve
 from tests.core.live_service import Service, live_service
 
-VERBS = ["run", "bench", "data check", "data studio", "submit", "watch", "jobs", "table", "cancel", "retry", "subjects"]
+VERBS = ["run", "bench", "data check", "data studio", "submit", "watch", "jobs", "table", "cancel", "retry", "subjects", "grid"]
 
 
 def test_help_is_instant_because_nothing_heavy_is_imported() -> None:
@@ -41,7 +41,7 @@ def test_every_verb_explains_itself(verb: str, capsys: pytest.CaptureFixture[str
     assert max(map(len, text.splitlines())) <= 120
 
 
-@pytest.mark.parametrize("verb", ["", "run", "submit", "data check", "data studio"])
+@pytest.mark.parametrize("verb", ["", "run", "submit", "grid", "data check", "data studio"])
 def test_help_teaches_by_examples_that_parse(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main([*verb.split(), "--help"])
