@@ -10,6 +10,7 @@ ServiceError
 ├── RequestError      a request contradicts the catalogue, or an earlier request with the same key
 ├── RenderError       nothing can be drawn now: the render process does not start, or does not answer
 ├── QuotaError        an owner has as many jobs as they may
+├── BackupError       a backup is damaged, or cannot be made or restored
 └── FencedError       this attempt no longer owns its job; nothing it says is stored
 """
 
@@ -66,3 +67,7 @@ class QuotaError(ServiceError):
 
 class FencedError(ServiceError):
     """An attempt that no longer owns its job; nothing it says is stored."""
+
+
+class BackupError(ServiceError):
+    """A backup is damaged, or cannot be made or restored."""
