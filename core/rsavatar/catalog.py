@@ -36,6 +36,7 @@ STUDIES: dict[str, str] = {  # rsavatar bench NAME: many jobs, one table
     "exposure": "rsavatar.bench.exposure",
     "losses": "rsavatar.bench.losses",
     "robustness": "rsavatar.bench.robustness",
+    "skips": "rsavatar.bench.skips",
     "superres": "rsavatar.bench.superres",
 }
 

@@ -187,7 +187,8 @@ def _surface(count: int, rng: np.random.Generator) -> tuple[Array, Array]:
     parts = [_on_capsule(*capsule, n, rng) for capsule, n in zip(capsules, drawn, strict=True)]
     points, normals = (np.concatenate(part) for part in zip(*parts, strict=True))
     inside = [_to_segment(points, a, b) < 0.985 * radius for a, b, radius in capsules]
-    outer = np.sort(rng.permutation(np.flatnonzero(~np.any(inside, axis=0)))[:count])  # by limb, as bodies' vertices are
+    outer = rng.permutation(np.flatnonzero(~np.any(inside, axis=0)))[:count]
+    outer = np.sort(outer)  # limb by limb, as bodies' vertices are
     return points[outer], normals[outer]
 
 

@@ -61,6 +61,7 @@ class Study:
     columns: tuple[Column, ...]
     reported: str = ""  # heading of the column of what others report; empty = there is none
     subjects: tuple[str, ...] = ("studio",)
+    each: Column = Column("psnr", "PSNR")  # is shown for every subject, where there are several
     score: str = ""  # "module:function" (spec, folder, out) -> more metrics, called where the job was run
 
 

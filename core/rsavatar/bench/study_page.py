@@ -33,15 +33,14 @@ def render(study: Study, result: StudyResult) -> str:
 def _table(study: Study, result: StudyResult, variants: Sequence[Variant], subjects: Sequence[str]) -> Iterator[str]:
     first, several = variants[0].name, len(subjects) > 1
     headings = ["variant", *(c.heading for c in study.columns), "Δ PSNR"]
-    headings += [f"PSNR, {s}" for s in subjects] if several else []
+    headings += [f"{study.each.heading}, {s}" for s in subjects] if several else []
     headings += [study.reported] if study.reported else []
     yield "| " + " | ".join(headings) + " |"
     yield "|---" + "|---:" * (len(headings) - 1) + "|"
     for variant in variants:
         cells = [variant.name, *(_cell(result, variant.name, c) for c in study.columns)]
         cells.append(_difference(result, variant.name, first))
-        psnr = Column("psnr", "")
-        cells += [_cell(result, variant.name, psnr, subject) for subject in subjects] if several else []
+        cells += [_cell(result, variant.name, study.each, subject) for subject in subjects] if several else []
         cells += [variant.reported or "–"] if study.reported else []
         yield "| " + " | ".join(cells) + " |"
 

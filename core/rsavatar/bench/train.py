@@ -1,7 +1,7 @@
 """``rsavatar bench train``: held-out PSNR against the seconds of training, for each method at one budget.
 
-Trains the draft preset on the subject in RSAVATAR_BENCH_SUBJECT (a folder), or on the built-in one. Looking at the
-held-out views is not counted as training, and changes no number of it.
+Trains ``--preset`` on each of ``--subjects``, or on the built-in one. Looking at the held-out views is not counted
+as training, and changes no number of it.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -17,10 +18,10 @@ import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict
 from rich.console import Console
-from rich.table import Table
 
 from rsavatar import __version__, catalog, kernels
 from rsavatar.bench.machine import Machine, describe
+from rsavatar.bench.study import place
 from rsavatar.body.find import find_body
 from rsavatar.checkpoint import Owner
 from rsavatar.data.base import Subject
@@ -52,15 +53,23 @@ class TrainingCurve(_Record):
     psnr_db: list[float]  # mean over the watched held-out views, in the dilated mask
 
 
+class SubjectCurves(_Record):
+    """All methods on one subject."""
+
+    subject: str
+    views: int
+    curves: list[TrainingCurve]
+    ahead_from_s: float | None  # seconds from which on rs-avatar is above the others
+
+
 class TrainResult(_Record):
     """``rsavatar bench train``."""
 
     kind: Literal["train"] = "train"
     machine: Machine
     command: str
-    subject: str
-    views: int
-    curves: list[TrainingCurve]
+    preset: str
+    subjects: list[SubjectCurves]
 
 
 class Watch:
@@ -101,9 +110,9 @@ class Watch:
         return float(np.mean(values))
 
 
-def curve(name: str, subject: Subject) -> TrainingCurve:
+def curve(name: str, subject: Subject, preset: str = "draft") -> TrainingCurve:
     """Train ``name`` on ``subject`` and watch it."""
-    spec = resolve({"method": name, "subject": subject.name, "preset": "draft"})
+    spec = resolve({"method": name, "subject": subject.name, "preset": preset})
     case = Case(spec, subject, find_body(spec.body, subject)[0])
     method: AbstractMethod = catalog.load(catalog.METHODS, name)()
     actor = build_actor(method, case)
@@ -115,12 +124,28 @@ def curve(name: str, subject: Subject) -> TrainingCurve:
     return TrainingCurve(method=name, seconds=watch.seconds, steps=watch.steps, psnr_db=watch.psnr_db)
 
 
-def plot(result: TrainResult, path: Path) -> None:
-    """The curves, as PNG and SVG."""
+def ahead_from(curves: Sequence[TrainingCurve], ours: str = "rs-avatar") -> float | None:
+    """Seconds of training from which on ``ours`` is above every other learned method's curve; None if it never is.
+
+    Curves are compared at all looks of all of them up to the end of the shortest, linearly between looks.
+    """
+    others = [c for c in curves if c.method not in (ours, "oracle")]
+    mine = next(c for c in curves if c.method == ours)
+    end = min(c.seconds[-1] for c in (mine, *others))
+    looks = sorted({t for c in (mine, *others) for t in c.seconds if t <= end})
+    best = np.max([np.interp(looks, c.seconds, c.psnr_db) for c in others], axis=0)
+    behind = np.flatnonzero(np.interp(looks, mine.seconds, mine.psnr_db) <= best)
+    if len(behind) == len(looks) or (len(behind) and behind[-1] == len(looks) - 1):
+        return None
+    return looks[int(behind[-1]) + 1] if len(behind) else looks[0]
+
+
+def plot(subject: SubjectCurves, path: Path) -> None:
+    """The curves of a subject, as PNG and SVG."""
     figure, axes = plt.subplots(figsize=(6.4, 4.0), layout="constrained")
-    for line in result.curves:
+    for line in subject.curves:
         axes.plot(line.seconds, line.psnr_db, label=line.method, marker=".", markersize=3)
-    axes.set(xlabel="seconds of training", ylabel="held-out PSNR, dB", title=f"{result.subject}, draft preset")
+    axes.set(xlabel="seconds of training", ylabel="held-out PSNR, dB", title=subject.subject)
     axes.set_xscale("log")
     axes.grid(alpha=0.3)
     axes.legend()
@@ -129,28 +154,58 @@ def plot(result: TrainResult, path: Path) -> None:
     plt.close(figure)
 
 
-def main(json: Path | None) -> int:
-    """Train, print, and write ``json`` and its plot."""
-    kernels.keep_memory()
+def page(result: TrainResult, stem: str = "train") -> str:
+    """The end of every curve as Markdown, with what it was taken on, and the pictures, which are named by ``stem``."""
+    machine = result.machine
+    lines = [
+        "# Training: held-out PSNR against seconds",
+        "",
+        f"Written by `{result.command}`, preset {result.preset}, seed 0; the JSON file beside it holds the curves. Looking"
+        " at the held-out views is not counted. Seconds are of the processor named here and grow when it is busy; who is"
+        " above whom carries over.",
+        "",
+        f"Commit {machine.commit}; {machine.processor}, {machine.cores} cores, {machine.threads} kernel threads,"
+        f" {machine.instructions}, load {machine.load:g} before.",
+    ]
+    for subject in result.subjects:
+        lines += ["", f"## {subject.subject}", "", f"![{subject.subject}]({stem}-{subject.subject}.png)", ""]
+        lines += ["| method | steps | seconds | PSNR at 10 s | PSNR at the end |", "|---|---:|---:|---:|---:|"]
+        for c in subject.curves:
+            early = np.interp(10.0, c.seconds, c.psnr_db)
+            cells = (c.method, f"{c.steps[-1]}", f"{c.seconds[-1]:.0f}", f"{early:.2f}", f"{c.psnr_db[-1]:.2f}")
+            lines.append("| " + " | ".join(cells) + " |")
+        ahead = "never" if subject.ahead_from_s is None else f"from {subject.ahead_from_s:.0f} s on"
+        lines += ["", f"rs-avatar is above the other learned methods {ahead}."]
+    return "\n".join(lines) + "\n"
+
+
+def main(json: Path | None, subjects: Sequence[str] = (), preset: str = "draft") -> int:
+    """Train every method on every subject, print, and write ``json``, its page and its plots."""
     kernels.use_threads(len(os.sched_getaffinity(0)))
     torch.set_num_threads(1)
-    folder = os.environ.get("RSAVATAR_BENCH_SUBJECT")
-    subject = open_subject(Path(folder).name, Path(folder)) if folder else open_subject("studio", None)
-    methods = [m for m in METHODS if m != "oracle" or subject.motion is not None]
-    machine, console = describe(), Console()
-    curves = []
-    for name in methods:
-        console.print(f"training {name} on {subject.name} ...")
-        curves.append(curve(name, subject))
-    views = len(subject.held_out) * min(VIEWS_PER_CAMERA, subject.frames)
-    command = "rsavatar bench train" + (f" --json {json}" if json else "")
-    result = TrainResult(machine=machine, command=command, subject=subject.name, views=views, curves=curves)
-    table = Table("method", "steps", "seconds", "PSNR, dB", title=f"{subject.name}, {views} held-out views")
-    for line in result.curves:
-        table.add_row(line.method, str(line.steps[-1]), f"{line.seconds[-1]:.0f}", f"{line.psnr_db[-1]:.2f}")
-    console.print(table)
-    if json:
-        json.parent.mkdir(parents=True, exist_ok=True)
-        json.write_text(result.model_dump_json(indent=1) + "\n")
-        plot(result, json)
+    places = [place(subject) for subject in subjects or ("studio",)]
+    machine, console, done = describe(), Console(), []
+    named = " ".join(["--subjects", *(name for name, _ in places)]) if subjects else ""
+    words = ["rsavatar bench train", named, f"--preset {preset}", f"--json {json.name}" if json else ""]
+    for name, folder in places:
+        done.append(curves_of(open_subject(name, folder), console, preset))
+        command = " ".join(filter(None, words))
+        result = TrainResult(machine=machine, command=command, preset=preset, subjects=done)
+        if json:
+            json.parent.mkdir(parents=True, exist_ok=True)
+            json.write_text(result.model_dump_json(indent=1) + "\n")
+            json.with_suffix(".md").write_text(page(result, json.stem))
+            plot(done[-1], json.with_name(f"{json.stem}-{name}"))
+    console.print(page(result), markup=False, highlight=False)
     return 0
+
+
+def curves_of(subject: Subject, console: Console, preset: str) -> SubjectCurves:
+    """Every method that the subject allows, one after the other."""
+    curves = []
+    for name in METHODS:
+        if name != "oracle" or subject.motion is not None:
+            console.print(f"training {name} on {subject.name} ...")
+            curves.append(curve(name, subject, preset))
+    views = len(subject.held_out) * min(VIEWS_PER_CAMERA, subject.frames)
+    return SubjectCurves(subject=subject.name, views=views, curves=curves, ahead_from_s=ahead_from(curves))
