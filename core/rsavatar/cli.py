@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from rsavatar import __version__
+from rsavatar import __version__, cli_data
 from rsavatar.catalog import STUDIES
 from rsavatar.errors import RsAvatarError
 
@@ -163,8 +163,9 @@ def _add_local(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     bench.add_argument("name", choices=["render", "growth", "train", "stability", *STUDIES])
     bench.add_argument("--json", type=Path, metavar="FILE", help="write the figures here as well")
     studies = bench.add_argument_group("of " + ", ".join(STUDIES), "many jobs; one that was cut goes on with --json")
-    studies.add_argument("--subjects", nargs="+", default=[], metavar="DIR", help="folders, studio-N, studio-N-exposed")
-    studies.add_argument("--preset", default="draft", help="default: draft")
+    where = "folders, studio-N, studio-N-exposed (also of train)"
+    studies.add_argument("--subjects", nargs="+", default=[], metavar="DIR", help=where)
+    studies.add_argument("--preset", default="draft", help="also of train (default: draft)")
     studies.add_argument("--seeds", type=int, default=1, metavar="N", help="seeds 0 to N - 1 (default: 1)")
     studies.add_argument("--jobs", type=int, default=1, metavar="N", help="processes at a time (default: 1)")
 
@@ -173,6 +174,7 @@ def _add_local(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     check.add_argument("directory", type=Path, metavar="DIR")
     check.add_argument("--body", default="auto", help="auto, anny, or an SMPL-format .npz or .pkl (default: auto)")
     check.add_argument("--json", action="store_true", help="the findings as one line of JSON")
+    cli_data.add_verbs(nouns, _add)
     studio = _add(
         nouns, "studio", "rsavatar.cli_local:studio", "make the built-in subject, without any download", STUDIO
     )

@@ -53,7 +53,8 @@ def bench(arguments: argparse.Namespace) -> int:
         if error.name not in {"rsavatar.bench", place}:
             raise
         raise SpecError(f"bench {arguments.name}: not available in this version") from None
-    return int(module.main(arguments.json) or 0)
+    more = (arguments.subjects, arguments.preset) if arguments.name == "train" else ()
+    return int(module.main(arguments.json, *more) or 0)
 
 
 def _study(place: str, arguments: argparse.Namespace) -> int:
