@@ -15,17 +15,16 @@ from typing import Any
 from fastapi import Response
 from fastapi.responses import FileResponse
 
-from rsavatar import __version__
 from services.api.renderer import Lane, Renderer
 from services.settings import Settings
+from services.store.content import code_sha256
 
-FORMAT = 1  # raise it when the same order is drawn differently
 KEPT_SHARE = 0.8  # of the limit that stays after a clean-up
 
 
 def key_of(order: Mapping[str, Any]) -> str:
-    """SHA-256 of an order and of who draws it; equal keys are equal drawings."""
-    whole = {"order": order, "version": __version__, "format": FORMAT}
+    """SHA-256 of an order and of the code that draws it; equal keys are equal drawings."""
+    whole = {"order": order, "code": code_sha256()}
     return hashlib.sha256(json.dumps(whole, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
