@@ -161,8 +161,8 @@ def page(result: TrainResult, stem: str = "train") -> str:
         "# Training: held-out PSNR against seconds",
         "",
         f"Written by `{result.command}`, preset {result.preset}, seed 0; the JSON file beside it holds the curves."
-        " Looking at the held-out views is not counted. Seconds are of the processor named here and grow when it is busy;"
-        " who is above whom carries over.",
+        " Looking at the held-out views is not counted. Seconds are of the processor named here and grow when it is"
+        " busy; who is above whom carries over.",
         "",
         f"Commit {machine.commit}; {machine.processor}, {machine.cores} cores, {machine.threads} kernel threads,"
         f" {machine.instructions}, load {machine.load:g} before.",
