@@ -2,7 +2,7 @@
 
 A message may be lost or delivered twice without harm: the worker claims a row, not a message, and the sweeper sends
 a new message for rows that nobody claims. The pool is of threads, because a thread only watches a process of its own
-that trains; so the settings that concern pools of processes have no place here.
+that trains. Settings about processes of a pool are for those who choose another pool; ours has none.
 """
 
 from __future__ import annotations
@@ -36,6 +36,8 @@ def make_app(settings: Settings) -> Celery:
         accept_content=["json"],
         task_ignore_result=True,
         task_acks_late=True,
+        task_retry_on_worker_lost=True,
+        task_reject_on_worker_lost=True,
         task_track_started=False,
         task_default_queue=QUEUE,
         task_queues=[Queue(QUEUE)],
@@ -44,6 +46,9 @@ def make_app(settings: Settings) -> Celery:
         worker_pool="threads",
         worker_concurrency=settings.worker_concurrency,
         worker_prefetch_multiplier=1,
+        worker_max_tasks_per_child=1,
+        worker_pool_start_method="spawn",
+        worker_soft_shutdown_timeout=settings.grace_seconds,
         worker_hijack_root_logger=False,
         worker_enable_remote_control=False,  # orders go through the database
         worker_cancel_long_running_tasks_on_connection_loss=False,
@@ -51,6 +56,7 @@ def make_app(settings: Settings) -> Celery:
         broker_connection_max_retries=None,
         visibility_timeout=VISIBILITY_SECONDS,
         broker_transport_options=_transport(),
+        result_backend_transport_options={"visibility_timeout": VISIBILITY_SECONDS},
     )
     return app
 

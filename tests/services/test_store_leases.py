@@ -13,6 +13,8 @@ from services.store.records import Batch, Claim, Event, Failure, Look, Outcome, 
 from services.store.session import Store
 from tests.services.conftest import submit
 
+ON_BOTH_DATABASES = True
+
 RESULT = Outcome({"psnr": 20.0}, {}, {}, {}, 5, 1.0, 1.0, (Score("01", 3, "psnr", 20.0),))
 
 

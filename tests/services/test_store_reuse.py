@@ -9,6 +9,8 @@ from services.store.records import Artifact, Claim, Failure, Job, Outcome, Score
 from services.store.session import Store
 from tests.services.conftest import SPEC
 
+ON_BOTH_DATABASES = True
+
 SAME, OTHER = "c" * 64, "d" * 64
 FILE = Artifact("final", "e" * 64, "application/json", 3)
 RESULT = Outcome({"psnr": 20.0}, {}, {}, {}, 5, 1.0, 1.0, (Score("01", 3, "psnr", 20.0),), (FILE,))
