@@ -60,7 +60,7 @@ def load(root: Path, pixel_centre: float | None = None) -> Subject:
         for camera, folder in folders.items()
         for index, frame in enumerate(locate(folder.images, folder.masks, numbers))
     }
-    centre = _pixel_centre(root) if pixel_centre is None else pixel_centre
+    centre = pixel_centre_of(root) if pixel_centre is None else pixel_centre
     read = _reader(frames, calibrations, centre)
     return Subject(
         name=root.resolve().name,
@@ -122,7 +122,12 @@ def _frame_numbers(folders: Mapping[str, Folders], fits: Path) -> list[int]:
     return sorted(fitted & seen)
 
 
-def _pixel_centre(root: Path) -> float:
+def pixel_centre_of(root: Path) -> float:
+    """Where K puts the first pixel's centre: what a ``meta.json`` in ``root`` or above it says, else 0.
+
+    Raises:
+        DataError: if that file is no JSON object.
+    """
     for path in (root / "meta.json", root.resolve().parent / "meta.json"):
         if path.is_file():
             try:
