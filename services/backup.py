@@ -133,11 +133,10 @@ def restore(settings: Settings, folder: Path) -> Manifest:
     manifest = verify(folder)
     make_home(settings)
     store, pool = Store(settings), folder.parent / "pool"
-    if backup.kind_of(store) != manifest.kind:
-        raise BackupError("database", f"{manifest.kind}, as in the backup", backup.kind_of(store))
-    backup.load(store, folder / backup.FILES[manifest.kind])
-    store = Store(settings)
     try:
+        if backup.kind_of(store) != manifest.kind:
+            raise BackupError("database", f"{manifest.kind}, as in the backup", backup.kind_of(store))
+        backup.load(store, folder / backup.FILES[manifest.kind])
         for sha256 in manifest.artifacts:
             incoming = new_incoming(store.blobs.root)
             copy_verified(path_of(pool, sha256), incoming, sha256)

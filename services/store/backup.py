@@ -71,7 +71,7 @@ def load(store: Store, file: Path) -> None:
         _run(store, ["pg_restore", *words], names_database=True)
         return
     place = Path(str(store.engine.url.database))
-    store.close()
+    store.close()  # connections to the file that is replaced; the next use opens new ones
     for suffix in ("-wal", "-shm"):
         place.with_name(place.name + suffix).unlink(missing_ok=True)
     shutil.copyfile(file, place)
