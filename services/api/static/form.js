@@ -68,12 +68,21 @@ function blame(problem) {
   first?.focus();
 }
 
+function blameLocally() { // what the browser can tell by itself
+  const wrong = [...form.querySelectorAll(".choice input")].filter((input) => !input.checkValidity());
+  if (!wrong.length) return false;
+  const errors = wrong.map((i) => ({ name: i.name, expected: i.validationMessage.replace(/\.$/, ""), got: i.value }));
+  blame({ errors, detail: "" });
+  return true;
+}
+
 async function estimate() {
   const place = form.querySelector("[data-estimate]"), basis = form.querySelector("[data-basis]");
+  if (!form.checkValidity()) { place.textContent = "not a job yet"; basis.textContent = "A value is out of its range."; return; }
   const reply = await send(`${api}/grids?dry_run=true`, {
     headers: { "content-type": "application/json" }, body: JSON.stringify({ name: "estimate", base: spec() }),
   });
-  if (!reply.ok) { clear(); place.textContent = "not a job yet"; basis.textContent = await reasonOf(reply); return; }
+  if (!reply.ok) { place.textContent = "not a job yet"; basis.textContent = await reasonOf(reply); return; }
   clear();
   const plan = await reply.json(), found = plan.estimates[0];
   const wait = plan.eta_seconds > found.seconds * 1.5 ? `, ${duration(plan.eta_seconds)} with the queue` : "";
@@ -92,8 +101,9 @@ form.addEventListener("input", changed);
 form.addEventListener("submit", async (event) => {
   event.preventDefault();
   const button = form.querySelector("[type=submit]");
-  button.disabled = true;
   clear();
+  if (blameLocally()) return;
+  button.disabled = true;
   const body = JSON.stringify(spec());
   const headers = { "content-type": "application/json", "idempotency-key": `${key}-${hash(body)}` };
   const reply = await send(`${api}/jobs`, { headers, body });
