@@ -41,6 +41,7 @@ from services.api.deps import Backend
 from services.api.drawings import Drawings
 from services.api.gate import Gate
 from services.api.guard import Guard
+from services.api.intake import Intake
 from services.api.trail import Trail, latencies, routes_by_endpoint
 from services.settings import Settings
 from services.store import schema
@@ -94,7 +95,9 @@ def create_app(settings: Settings) -> FastAPI:
         redoc_url=None,
         lifespan=lifespan,
     )
-    app.state.backend = Backend(settings, store, wake_up.make_app(settings), drawings)
+    broker = wake_up.make_app(settings)
+    intake = Intake(store, broker, settings.max_attempts)
+    app.state.backend = Backend(settings, store, broker, drawings, intake)
     app.state.registry = CollectorRegistry()
     _add_routes(app)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")

@@ -9,6 +9,7 @@ from celery import Celery
 from fastapi import Depends, Path, Request
 
 from services.api.drawings import Drawings
+from services.api.intake import Intake
 from services.settings import Settings
 from services.store.session import Store
 
@@ -17,12 +18,13 @@ UUID = r"^[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}$"
 
 @dataclass(frozen=True)
 class Backend:
-    """Settings, database, broker and drawings of one application."""
+    """Settings, database, broker, drawings and intake of one application."""
 
     settings: Settings
     store: Store
     broker: Celery
     drawings: Drawings
+    intake: Intake
 
 
 def backend(request: Request) -> Backend:

@@ -11,12 +11,11 @@ from fastapi.responses import PlainTextResponse
 from services import jobs as wake_up
 from services.api.access import Who
 from services.api.deps import Back, JobId
+from services.api.intake import Wish
 from services.api.requests import JobQuery, JobRequest, checked_key
 from services.api.views import ArtifactView, JobDetail, JobPage, JobView, ResultView
-from services.errors import NotFoundError, RequestError
-from services.store import artifacts, jobs, labels, listing, metrics, subjects
-from services.store.content import content_sha256
-from services.store.records import Filters, Job, State, Submission
+from services.store import artifacts, jobs, labels, listing, metrics
+from services.store.records import Filters, Job, State
 from services.store.session import Store
 
 LOG_BYTES = 65_536
@@ -35,7 +34,7 @@ KNOWN = {"model": JobDetail, "description": "the key's earlier job, or a known r
 
 
 @router.post("", status_code=202, responses={200: KNOWN})
-def submit(
+async def submit(
     request: JobRequest,
     response: Response,
     back: Back,
@@ -47,18 +46,8 @@ def submit(
     that is known: the new job has ended with it, and ``reused_from`` says whose it is.
     """
     key = checked_key(idempotency_key)
-    spec = request.resolve()
-    try:
-        subject = subjects.get(back.store, spec.subject)
-    except NotFoundError as error:
-        raise RequestError(error.name, error.expected, error.got) from None
-    stored = spec.model_dump(mode="json", by_alias=True)
-    content = content_sha256(back.store, spec, subject)
-    about = {"owner": who.owner, "content_sha256": content, "forced": force}
-    limits = back.settings.max_attempts
-    job, is_new = jobs.submit(back.store, Submission(stored, spec.sha256(), request.sha256(), limits, key, **about))
-    if is_new and job.state == State.QUEUED:
-        wake_up.enqueue(back.broker, job.id)
+    wish = Wish(request.resolve(), request.sha256(), who.owner, key, force)
+    job, is_new = await back.intake.submit(wish)
     response.status_code = 202 if is_new and job.state == State.QUEUED else 200
     response.headers["location"] = f"/api/v1/jobs/{job.id}"
     return JobDetail.of(job)

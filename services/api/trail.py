@@ -10,13 +10,13 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-import anyio
 from fastapi import FastAPI
 from fastapi.routing import iter_route_contexts
 from prometheus_client import CollectorRegistry, Histogram
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from services.api.access import SAFE_METHODS, Caller
+from services.api.batches import Batches
 from services.store import audit
 from services.store.session import Store
 
@@ -39,7 +39,7 @@ class Trail:
 
     def __init__(self, app: ASGIApp, store: Store, histogram: Histogram, routes: Mapping[Any, str]) -> None:
         self._app = app
-        self._store = store
+        self._log: Batches[audit.Entry, audit.Record] = Batches(lambda entries: audit.append_many(store, entries))
         self._histogram = histogram
         self._routes = routes
 
@@ -71,7 +71,7 @@ class Trail:
             return
         entry = entry_of(scope, status, headers.get(b"location", b"").decode("latin1"))
         try:
-            await anyio.to_thread.run_sync(audit.append, self._store, entry)
+            await self._log.ask(entry)
         except Exception:  # what was done is done: the log file is the second place to find it
             log.exception("not in the audit log: %s", entry)
 

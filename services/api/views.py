@@ -10,8 +10,7 @@ from pydantic import BaseModel
 
 from services.store.records import TERMINAL, Artifact, Job, Outcome, State, Subject, fraction_of
 
-
-PLAIN = ("id", "state", "method", "subject", "priority", "grid_id", "owner", "reused_from")
+PLAIN: tuple[str, ...] = ("id", "state", "method", "subject", "priority", "grid_id", "owner", "reused_from")
 PLAIN += ("attempt", "failures", "max_attempts", "rss_bytes")
 DETAILS = ("spec_sha256", "content_sha256", "forced", "notes", "first_traceback")
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from sqlalchemy import select, text
+from sqlalchemy import insert, select, text
 from sqlalchemy.orm import Session
 
 from services.store.session import Store, db_now
@@ -64,17 +64,30 @@ NAMES = tuple(f.name for f in fields(Entry))
 
 def append(store: Store, entry: Entry) -> Record:
     """Add an entry to the end of the chain; writers wait for each other."""
+    return append_many(store, [entry])[0]
+
+
+def append_many(store: Store, entries: Sequence[Entry]) -> list[Record]:
+    """Add entries in their order, in one transaction."""
     with store.write() as session:
         if session.get_bind().dialect.name == "postgresql":
             session.execute(text("select pg_advisory_xact_lock(:key)"), {"key": CHAIN_LOCK})
-        last = session.scalar(select(AuditRow.sha256).order_by(AuditRow.id.desc()).limit(1))
+        previous = session.scalar(select(AuditRow.sha256).order_by(AuditRow.id.desc()).limit(1)) or GENESIS
         at = float(session.scalar(select(db_now())) or 0.0)
-        values = {name: _cut(name, getattr(entry, name)) for name in NAMES}
-        previous = last or GENESIS
-        row = AuditRow(at=at, previous_sha256=previous, sha256=link(previous, at, values), **values)
-        session.add(row)
-        session.flush()
-        return _record(row)
+        rows = []
+        for entry in entries:
+            values = {name: _cut(name, getattr(entry, name)) for name in NAMES}
+            sha256 = link(previous, at, values)
+            rows.append({"at": at, "previous_sha256": previous, "sha256": sha256, **values})
+            previous = sha256
+        ordered = insert(AuditRow).returning(AuditRow.id, sort_by_parameter_order=True)
+        ids = session.scalars(ordered, rows).all()
+        return [_written(row_id, row) for row_id, row in zip(ids, rows, strict=True)]
+
+
+def _written(row_id: int, row: Mapping[str, Any]) -> Record:
+    entry = Entry(**{name: row[name] for name in NAMES})
+    return Record(row_id, row["at"], entry, row["previous_sha256"], row["sha256"])
 
 
 def link(previous: str, at: float, values: Mapping[str, Any]) -> str:

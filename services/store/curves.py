@@ -11,7 +11,7 @@ from itertools import groupby
 from operator import itemgetter
 from typing import Any
 
-from sqlalchemy import Row, select
+from sqlalchemy import select
 
 from services.errors import NotFoundError
 from services.store.session import Store
@@ -45,7 +45,7 @@ def of_jobs(
     return {job_id: drawn.get(source[job_id], {}) for job_id in job_ids}
 
 
-def _curves(rows: Sequence[Row[Any]]) -> Iterator[tuple[str, str, Curve]]:
+def _curves(rows: Sequence[Any]) -> Iterator[tuple[str, str, Curve]]:
     for (job_id, key), group in groupby(rows, itemgetter(0, 1)):
         yield job_id, key, [(row[2], row[3]) for row in group]
 

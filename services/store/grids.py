@@ -17,11 +17,11 @@ from sqlalchemy.orm import Session
 from rsavatar.grids.cells import Cell
 from rsavatar.grids.request import GridRequest
 from services.errors import NotFoundError, RequestError
-from services.store import events, owners, reuse
+from services.store import intake, owners
 from services.store.ids import new_id
 from services.store.records import State, Submission, fraction_of
 from services.store.session import Store, db_now
-from services.store.tables import LOCAL, EventRow, GridRow, JobRow, ResultRow
+from services.store.tables import LOCAL, GridRow, JobRow, ResultRow
 
 METRICS = ("psnr", "ssim", "flip", "lpips", "joint_mm", "sub_frame_joint_mm", "train_seconds", "evaluate_seconds")
 LOOK = ("id", "state", "stage", "step", "steps", "eta_seconds", "gaussians", "error_kind", "error", "reused_from")
@@ -110,15 +110,16 @@ def _submit(store: Store, order: Order) -> tuple[Grid, bool, list[str]]:
         now = session.scalar(select(db_now())) or 0.0
         asked = order.request.model_dump(mode="json")
         parts = {name: asked[name] for name in ("name", "base", "axes", "includes", "excludes")}
-        owners.require_room(session, store, order.owner, len(order.cells))
+        refusal = owners.room(session, store, order.owner).take(len(order.cells))
+        if refusal is not None:
+            raise refusal
+        now = session.scalar(select(db_now())) or 0.0
+        asked = order.request.model_dump(mode="json")
+        parts = {name: asked[name] for name in ("name", "base", "axes", "includes", "excludes")}
         grid = Grid(id=new_id(), owner=order.owner, notes=asked["about"], created_at=now, **parts)
         session.execute(insert(GridRow).values(asdict(grid)))
-        rows = [_job(order, grid, cell) for cell in order.cells]
-        session.execute(insert(JobRow), rows)
-        state = events.state_event(State.QUEUED)
-        told = {"kind": state.kind, "payload": dict(state.payload), "created_at": now}
-        session.execute(insert(EventRow), [{"job_id": row["id"], **told} for row in rows])
-        ended = set(reuse.adopt_all(session, _known_results(session, rows)))
+        rows = [intake.row_of(_submission(order, grid, cell), now) for cell in order.cells]
+        ended = set(intake.add(session, rows))
         return grid, True, [row["id"] for row in rows if row["id"] not in ended]
 
 
@@ -137,36 +138,19 @@ def _known(session: Session, order: Order) -> Grid | None:
     return grid
 
 
-def _known_results(session: Session, rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Jobs among ``rows`` whose result some finished job has."""
-    contents = {row["content_sha256"] for row in rows} - {None}
-    same = JobRow.content_sha256.in_(contents) & (JobRow.state == State.SUCCEEDED) & JobRow.reused_from.is_(None)
-    found = set(session.scalars(select(JobRow.content_sha256).where(same))) if contents else set()
-    return [row["id"] for row in rows if row["content_sha256"] in found]
-
-
-def _job(order: Order, grid: Grid, cell: Cell) -> dict[str, Any]:
-    spec = cell.spec.model_dump(mode="json", by_alias=True)
+def _submission(order: Order, grid: Grid, cell: Cell) -> Submission:
     sha256 = cell.spec.sha256()
-    key = f"{order.key or grid.id} {cell.number}"
-    submission = Submission(
-        spec,
+    return Submission(
+        cell.spec.model_dump(mode="json", by_alias=True),
         spec_sha256=sha256,
         request_sha256=sha256,
         max_attempts=order.max_attempts,
-        idempotency_key=key,
+        idempotency_key=f"{order.key or grid.id} {cell.number}",
         grid_id=grid.id,
         owner=order.owner,
         content_sha256=order.contents.get(sha256),
         forced=order.forced,
     )
-    return {"id": new_id(), "created_at": grid.created_at, **_columns(submission)}
-
-
-def _columns(submission: Submission) -> dict[str, Any]:
-    spec = submission.spec
-    named = {name: spec[name] for name in ("method", "subject", "priority")}
-    return {**asdict(submission), **named, "state": State.QUEUED}
 
 
 def get(store: Store, grid_id: str) -> Grid:

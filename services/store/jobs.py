@@ -3,68 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import Any
 
 from sqlalchemy import ColumnElement, func, select, update
-from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
-from services.errors import ConflictError, NotFoundError, RequestError
-from services.store import events, owners, reuse
+from services.errors import ConflictError, NotFoundError
+from services.store import events
 from services.store.filters import where
-from services.store.ids import new_id
-from services.store.records import RETRYABLE, Filters, Job, State, Submission
+from services.store.intake import submit, to_job
+from services.store.records import RETRYABLE, Filters, Job, State
 from services.store.session import Store, db_now
 from services.store.tables import JobRow
 
-FIELDS = tuple(f.name for f in fields(Job))
+__all__ = ["cancel", "count_by_state", "get", "oldest_wait", "page", "pause", "resume", "retry", "submit", "to_job"]
 NO_ORDERS = {"cancel_requested_at": None, "pause_requested_at": None}
-
-
-def to_job(row: JobRow) -> Job:
-    """The record of a row."""
-    return Job(**{name: getattr(row, name) for name in FIELDS})
-
-
-def submit(store: Store, submission: Submission) -> tuple[Job, bool]:
-    """Accept a job; the second value says whether it is new. After the return the job cannot be lost.
-
-    Where a finished job has the same content, the new one has succeeded already, with its result.
-
-    Raises:
-        RequestError: if the idempotency key was used for another request.
-        QuotaError: if as many jobs of the owner wait as may.
-    """
-    try:
-        return _submit(store, submission)
-    except IntegrityError:  # another process took the key between our look and our insert; now we see its job
-        return _submit(store, submission)
-
-
-def _submit(store: Store, submission: Submission) -> tuple[Job, bool]:
-    with store.write() as session:
-        if submission.idempotency_key is not None:
-            mine = (JobRow.owner == submission.owner) & (JobRow.idempotency_key == submission.idempotency_key)
-            query = select(JobRow).where(mine)
-            if (earlier := session.scalar(query)) is not None:
-                if earlier.request_sha256 != submission.request_sha256:
-                    raise RequestError("Idempotency-Key", "the request it was first used for", "another request")
-                return to_job(earlier), False
-        owners.require_room(session, store, submission.owner)
-        row = JobRow(id=new_id(), created_at=session.scalar(select(db_now())), **_columns(submission))
-        session.add(row)
-        session.flush()
-        events.append(session, row.id, [events.state_event(State.QUEUED)])
-        if reuse.adopt(session, row):
-            session.refresh(row)
-        return to_job(row), True
-
-
-def _columns(submission: Submission) -> dict[str, Any]:
-    spec = dict(submission.spec)
-    named = {name: spec[name] for name in ("method", "subject", "priority")}
-    return {**vars(submission), "spec": spec, **named, "state": State.QUEUED}
 
 
 def get(store: Store, job_id: str) -> Job:
