@@ -80,6 +80,9 @@ class TestAblations:
         whole, without = parts(small_subject.case()), parts(small_subject.case(ablation={flag: True}))
         assert whole - without == {part}
 
+    def test_calibration_adds_a_clock_and_nothing_else(self) -> None:
+        assert parts(small_subject.case(calibrate=["readout"])) - parts(small_subject.case()) == {"clock"}
+
     def test_no_rs_takes_the_readout_for_zero(self) -> None:
         case = small_subject.case(ablation={"no_rs": True})
         assert [s.rate for s in method_of(case).shutter(case).slots(40, 11.0, 2.0)] == [0.0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -94,6 +95,42 @@ def test_fits_of_69_numbers_are_padded(tmp_path: Path) -> None:
     for path in (files.root / "rs/new_params").iterdir():
         edit(path, lambda fit: fit.update(poses=fit["poses"][:, 3:]))
     assert np.array_equal(load(files.root).fit.poses, files.poses)
+
+
+def test_exposure_rate_and_missing_images_are_read(tmp_path: Path) -> None:
+    root = write_rolling(tmp_path / "figure").root
+    edit_meta(root, exposure=2.5, fps=120, missing=[[4, 0], [10, 3]])
+    (root / "rs/images/04/000000.png").unlink()
+    (root / "rs/mask/10/000003.png").unlink()
+    subject = load(root)
+    assert (subject.timing.exposure_frames, subject.timing.fps) == (2.5, 120.0)
+    assert subject.missing == {("04", 0), ("10", 3)}
+    assert subject.observe("04", 1)[1].any()
+    with pytest.raises(DataError, match="camera '04', frame 0"):
+        subject.observe("04", 0)
+    plain = load(write_rolling(tmp_path / "plain").root)
+    assert (plain.timing.exposure_frames, plain.timing.fps, plain.missing) == (0.0, None, frozenset())
+
+
+@pytest.mark.parametrize(
+    ("word", "value", "sentence"),
+    [
+        ("exposure", -1.0, "exposure and fps: expected exposure >= 0"),
+        ("fps", 0, "exposure and fps"),
+        ("missing", [[0, 0]], "missing: expected pairs of a training camera and a frame"),
+        ("missing", [[4, FRAMES]], "missing: expected pairs"),
+    ],
+)
+def test_impossible_words_of_the_capture_are_refused(tmp_path: Path, word: str, value: object, sentence: str) -> None:
+    root = write_rolling(tmp_path / "figure").root
+    edit_meta(root, **{word: value})
+    with pytest.raises(DataError, match=sentence):
+        load(root)
+
+
+def edit_meta(root: Path, **words: object) -> None:
+    path = root / "meta.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **words}))
 
 
 def test_without_sharp_images_nothing_is_held_out(tmp_path: Path) -> None:

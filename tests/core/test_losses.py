@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
 from rsavatar import kernels
-from rsavatar.losses import l1
+from rsavatar.losses import dissimilarity, l1
+from rsavatar.metrics.image import ssim_map
 from rsavatar.render.base import Rendering
 
 pytestmark = pytest.mark.skipif(not kernels.available(), reason="no native kernels were built for this machine")
@@ -51,3 +53,37 @@ def test_the_number_of_threads_does_not_matter() -> None:
     finally:
         kernels.use_threads(before)
     assert len(values) == 1
+
+
+class TestDissimilarity:
+    def images(self, dtype: torch.dtype) -> tuple[Rendering, torch.Tensor]:
+        g = torch.Generator().manual_seed(3)
+        rgb = torch.rand(3, 21, 17, generator=g).to(dtype)
+        return Rendering(rgb, torch.ones(21, 17)), torch.randint(0, 256, (3, 21, 17), generator=g, dtype=torch.uint8)
+
+    def test_an_image_is_like_itself(self) -> None:
+        _, target = self.images(torch.float64)
+        same = Rendering(target.double() / 255, torch.ones(21, 17))
+        assert float(dissimilarity(same, target)) == pytest.approx(0, abs=1e-12)
+
+    def test_it_is_one_minus_the_metric_over_whole_windows(self) -> None:
+        image, target = self.images(torch.float64)
+        x, y = (t.permute(1, 2, 0).numpy() for t in (image.rgb, target.double() / 255))
+        wanted = 1 - np.asarray(ssim_map(x, y))[5:-5, 5:-5].mean()
+        assert float(dissimilarity(image, target)) == pytest.approx(wanted, abs=1e-9)
+
+    def test_its_gradient_is_right(self) -> None:
+        image, target = self.images(torch.float64)
+        rgb = image.rgb[:, :13, :12].contiguous().requires_grad_()
+        small = target[:, :13, :12].contiguous()
+        assert torch.autograd.gradcheck(
+            lambda x: dissimilarity(Rendering(x, torch.ones(13, 12)), small), rgb, fast_mode=True
+        )
+
+    def test_an_image_smaller_than_the_window_adds_nothing(self) -> None:
+        rgb = torch.rand(3, 10, 30, requires_grad=True)
+        value = dissimilarity(Rendering(rgb, torch.ones(10, 30)), torch.zeros(3, 10, 30, dtype=torch.uint8))
+        value.backward()  # type: ignore[no-untyped-call]
+        assert float(value.detach()) == 0
+        assert rgb.grad is not None
+        assert float(rgb.grad.abs().max()) == 0

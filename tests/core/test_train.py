@@ -31,8 +31,12 @@ DENSITY = DensityRules(start=50, stop=200, every=50, gradient=1e-5)
 def train(
     folder: Path, method: AbstractMethod, stop_after: int | None = None, **changes: object
 ) -> tuple[Trained, list[Event], dict[str, torch.Tensor]]:
-    """Train on the small subject; asked to stop at the first block that ends at ``stop_after`` or later."""
-    case = small_subject.case(iterations=150, checkpoint_every=1000)
+    """Train on the small subject; asked to stop at the first block that ends at ``stop_after`` or later.
+
+    ``changes`` are of the settings; ``calibrate`` is of the spec.
+    """
+    words = {"calibrate": changes.pop("calibrate", [])}
+    case = small_subject.case(iterations=150, checkpoint_every=1000, **words)
     how = replace(settings(case), density=DENSITY, sh_from=60, **changes)  # type: ignore[arg-type]
     actor, events = build_actor(method, case), list[Event]()
     steps = [0]
@@ -81,6 +85,17 @@ def test_a_resumed_run_ends_like_an_undisturbed_one(tmp_path: Path) -> None:
     _, events, parts = train(tmp_path, RollingShutterAvatar())
     assert min(e.step for e in events if isinstance(e, Progress)) > 2 * BLOCK
     assert_same(whole, parts)
+
+
+def test_calibration_and_doubt_are_resumed_too(tmp_path: Path) -> None:
+    (tmp_path / "whole").mkdir()
+    words = {"calibrate": ["readout", "trigger"], "doubt_after": 50, "doubt_from": 0.0, "ssim_weight": 0.1}
+    _, _, whole = train(tmp_path / "whole", RollingShutterAvatar(), **words)
+    with pytest.raises(Interrupted):
+        train(tmp_path, RollingShutterAvatar(), stop_after=75, **words)
+    _, _, parts = train(tmp_path, RollingShutterAvatar(), **words)
+    assert_same(whole, parts)
+    assert float(whole["actor.clock.stretch"].abs().max()) > 0
 
 
 def test_the_number_of_threads_does_not_change_the_result(tmp_path: Path) -> None:
