@@ -8,6 +8,9 @@ from typing import Any
 METHODS: dict[str, str] = {
     "rs-avatar": "rsavatar.methods.rolling:RollingShutterAvatar",
     "gauhuman": "rsavatar.methods.oblivious:ShutterObliviousAvatar",
+    "cvr+gauhuman": "rsavatar.methods.two_stage:CVRThenAvatar",
+    "jamnet+gauhuman": "rsavatar.methods.two_stage:JAMNetThenAvatar",
+    "flow+gauhuman": "rsavatar.methods.two_stage:FlowThenAvatar",
     "mad-avatar": "rsavatar.methods.blur:BlurAvatar",
     "oracle": "rsavatar.methods.oracle:Oracle",
 }
@@ -21,6 +24,7 @@ MOTIONS: dict[str, str] = {
 DATASETS: dict[str, str] = {
     "rolling": "rsavatar.data.rolling:load",
     "zju": "rsavatar.data.zju:load",
+    "footage": "rsavatar.data.sharp:load",
 }
 
 METRICS: dict[str, str] = {
@@ -43,6 +47,9 @@ STUDIES: dict[str, str] = {  # rsavatar bench NAME: many jobs, one table
 DESCRIPTIONS: dict[str, str] = {
     "rs-avatar": "rolling-shutter model: every row rendered at its own instant (ours)",
     "gauhuman": "shutter-oblivious: one pose per frame, as if the frame were instantaneous",
+    "cvr+gauhuman": "two-stage: every view corrected by CVR, then gauhuman on what comes out",
+    "jamnet+gauhuman": "two-stage: every view corrected by JAMNet, then gauhuman on what comes out",
+    "flow+gauhuman": "two-stage: every view corrected by dense optical flow, no weights, then gauhuman",
     "mad-avatar": "blur model: the same spline and the same T renders, averaged instead of selected",
     "oracle": "the ceiling: trained with the true motion; needs a subject that has one",
 }

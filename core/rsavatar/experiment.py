@@ -99,8 +99,11 @@ def run(
     case = Case(spec, disturb(subject, spec.disturb, spec.seed), body)
     check_case(case)
     method: AbstractMethod = catalog.load(catalog.METHODS, spec.method)()
+    prepared = method.prepare(case, report, should_stop)
+    case = prepared.case
     actor = build_actor(method, case)
-    owner = Owner(spec.sha256(), subject.fingerprint, body.sha256, __version__)
+    code = f"{__version__}; {prepared.restorer}" if prepared.restorer else __version__
+    owner = Owner(spec.sha256(), subject.fingerprint, body.sha256, code)
     saver = Saver(_checkpoint_file(out, owner, report), owner)
     shown, seen = Shown(method, case, actor), observations(method, case)
     work = work_of(shown, seen)
@@ -115,13 +118,13 @@ def run(
     uncertain = bool(spec.calibrate or spec.disturb.readout or spec.disturb.trigger)
     result = Result(
         spec=spec,
-        means={**scored.means, **(schedule_errors(found, subject) if uncertain else {})},
+        means={**scored.means, **prepared.means, **(schedule_errors(found, subject) if uncertain else {})},
         scores=scored.scores,
         protocol=scored.protocol,
         gaussians=actor.avatar.count,
         train_seconds=trained.seconds,
         evaluate_seconds=scored.seconds,
-        provenance=_provenance(owner, trained) | {"work": work},
+        provenance=_provenance(owner, trained) | {"work": work, "restorer": prepared.restorer or None},
         artifacts=artifacts,
         schedule=found.to_json(subject.timing) if uncertain else {},
     )

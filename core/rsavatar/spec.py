@@ -35,7 +35,10 @@ CALIBRATING_METHODS = frozenset({"rs-avatar", "mad-avatar"})  # methods that kno
 FLAGS_OF_METHOD: dict[str, frozenset[str]] = {  # the components that a method has, so can lose
     "rs-avatar": frozenset({"no_rs", "no_spline", "no_pose_deformation", "no_lbs_refinement", "no_reg"}),
     "mad-avatar": frozenset({"no_spline", "no_pose_deformation", "no_lbs_refinement", "no_reg"}),
-    "gauhuman": frozenset({"no_pose_deformation", "no_lbs_refinement"}),
+    **dict.fromkeys(
+        ("gauhuman", "cvr+gauhuman", "jamnet+gauhuman", "flow+gauhuman"),
+        frozenset({"no_pose_deformation", "no_lbs_refinement"}),
+    ),
     "oracle": frozenset({"no_lbs_refinement"}),
 }
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from rsavatar.avatar.surface import Surface
 from rsavatar.body.base import BodyModel
 from rsavatar.data.base import BodyFit, Bytes, Subject
 from rsavatar.errors import DataError, SpecError, expected
+from rsavatar.events import Report
 from rsavatar.imaging import Actor, Schedule, plan
 from rsavatar.motion.base import AbstractMotion, InitialMotion
 from rsavatar.motion.sequence import SequenceSpline
@@ -67,12 +69,25 @@ def sub_frame_motion(case: Case) -> AbstractMotion:
     return FrameSpline(initial, case.bands, spec.P, spec.perturbation, spec.seed)
 
 
+@dataclass(frozen=True)
+class Prepared:
+    """A case that is ready to be trained on, and what was found and used on the way."""
+
+    case: Case
+    means: Mapping[str, float] = field(default_factory=dict)
+    restorer: str = ""  # what changed the pictures, weights included
+
+
 class AbstractMethod(ABC):
     """A motion model and an image formation model.
 
     **Contract**: both are functions of the case alone; every method gets the same Gaussians, losses, optimiser and
     number of steps.
     """
+
+    def prepare(self, case: Case, report: Report, should_stop: Callable[[], bool]) -> Prepared:
+        """What is done to the pictures before training: nothing, but by the methods that correct them first."""
+        return Prepared(case)
 
     @abstractmethod
     def motion(self, case: Case) -> AbstractMotion:

@@ -45,12 +45,14 @@ class Synthesis:
     coarse: tuple[Tensor, Tensor]  # both frames brought there by the undistortion flows
     fine: tuple[Tensor, Tensor]  # and by the refined ones
     flows: tuple[Tensor, Tensor]  # refined, [B, 2, H, W]
+    metrics: tuple[Tensor, Tensor]  # of the splatting
     weights: tuple[Tensor, Tensor]  # [B, 1, H, W] of the two in the blend
 
-    def blend(self, first: Tensor, second: Tensor) -> Tensor:
-        """Anything that was brought there, blended as the picture was."""
-        a, b = self.weights
-        return (a * first + b * second) / (a + b)
+    def carried(self, first: Tensor, second: Tensor) -> Tensor:
+        """Anything that belongs to the two frames [B, C, H, W], moved and blended as they were."""
+        pictures = zip((first, second), self.flows, self.metrics, strict=True)
+        a, b = (splat(image, flow, metric) for image, flow, metric in pictures)
+        return (self.weights[0] * a + self.weights[1] * b) / (self.weights[0] + self.weights[1])
 
 
 class CVR(nn.Module):
@@ -97,7 +99,8 @@ class CVR(nn.Module):
         visible = found[:, 4:5].sigmoid()
         weights = ((1 - late) * visible, late * (1 - visible))
         image = (weights[0] * fine[0] + weights[1] * fine[1]) / (weights[0] + weights[1])
-        return Synthesis(image, coarse, fine, (from_a, from_b), weights)
+        metrics = (flows.forth_metric, flows.back_metric)
+        return Synthesis(image, coarse, fine, (from_a, from_b), metrics, weights)
 
 
 def undistortion(flows: Flows, time: float, rows: int) -> tuple[Tensor, Tensor]:

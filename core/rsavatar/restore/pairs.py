@@ -70,6 +70,26 @@ def read_pack(path: Path) -> list[Take]:
         raise DataError(expected(str(path), "a pack of training pairs", error or "too few images")) from error
 
 
+def shrunk(take: Take, factor: int) -> Take:
+    """The take ``factor`` times smaller: means over squares of pixels.
+
+    Raises:
+        DataError: if the size is not a multiple of ``factor``.
+    """
+    if factor == 1:
+        return take
+    height, width = take.rolling.shape[1:3]
+    if height % factor or width % factor:
+        raise DataError(expected("size of training pairs", f"multiples of {factor}", (height, width)))
+
+    def smaller(stack: Bytes) -> Bytes:
+        split = stack.reshape(len(stack), height // factor, factor, width // factor, factor, 3)
+        return (split.mean((2, 4)) + 0.5).astype(np.uint8)
+
+    first = None if take.first is None else smaller(take.first)
+    return Take(smaller(take.rolling), smaller(take.middle), first)
+
+
 def _images(take: Take) -> Iterator[Bytes]:
     for stack in (take.rolling, take.middle, take.first):
         if stack is not None:

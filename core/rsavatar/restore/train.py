@@ -18,10 +18,11 @@ from torch import Tensor, nn
 
 from rsavatar.errors import DataError, DivergedError, Interrupted, expected
 from rsavatar.events import Note, Progress, Report, silent
+from rsavatar.restore.beginnings import begin
 from rsavatar.restore.cvr import CVR
 from rsavatar.restore.jamnet import JAMNet
 from rsavatar.restore.losses import Perception, cvr_loss, flow_loss, jamnet_loss
-from rsavatar.restore.pairs import Take
+from rsavatar.restore.pairs import Take, shrunk
 from rsavatar.restore.sampling import Batch, Sampler
 from rsavatar.restore.weights import NAMES, Name, Shape, header_of, load_state, read_state
 
@@ -41,6 +42,7 @@ class Recipe:
     minutes: float = math.inf  # stop here if the steps are not done; the rate falls by whichever ends first
     batch: int = 8
     columns: int = 192
+    shrink: int = 1  # times smaller than the pairs are: fast first steps
     rate: float = 1e-4
     warmup: float = 0.25  # CVR from nothing: part of the training that teaches its flow alone
     seed: int = 0
@@ -51,9 +53,9 @@ class Recipe:
     def __post_init__(self) -> None:
         if self.model not in NAMES:
             raise DataError(expected("model", f"one of {', '.join(NAMES)}", repr(self.model)))
-        if self.columns % 64 or not 0 < self.width <= 1 or min(self.steps, self.batch, self.every) < 1:
-            got = (self.columns, self.width, self.steps, self.batch, self.every)
-            wanted = "columns a multiple of 64, width in (0, 1], steps, batch, every of at least 1"
+        if self.columns % 64 or not 0 < self.width <= 1 or min(self.steps, self.batch, self.every, self.shrink) < 1:
+            got = (self.columns, self.width, self.steps, self.batch, self.every, self.shrink)
+            wanted = "columns a multiple of 64, width in (0, 1], steps, batch, every, shrink of at least 1"
             raise DataError(expected("recipe", wanted, got))
         if not (self.rate > 0 and self.minutes > 0 and 0 <= self.warmup < 1 and self.held_out >= 0):
             got = (self.rate, self.minutes, self.warmup, self.held_out)
@@ -86,6 +88,7 @@ class Trainer:
             raise DataError(expected("training pairs", f"more than the {recipe.held_out} takes held out", len(takes)))
         device = _device(start.device)
         torch.backends.cudnn.benchmark = True  # every batch has one shape
+        takes = [shrunk(take, recipe.shrink) for take in takes]
         cut = len(takes) - recipe.held_out
         self.recipe, self.out, self.start = recipe, out, start
         self.train_set = Sampler(takes[:cut], recipe.columns, device, recipe.seed)
@@ -93,7 +96,9 @@ class Trainer:
         self.checks = Sampler(held_out, recipe.columns, device, recipe.seed).pairs() if held_out else []
         torch.manual_seed(recipe.seed)
         self.network = recipe.shape.build().to(device)
-        if start.init is not None:
+        if start.init is None:
+            begin(self.network)
+        else:
             load_state(self.network, read_state(start.init), f"weights {start.init}")
         self.perception = Perception(start.vgg).to(device) if start.vgg else None
         self.optimizer = torch.optim.Adam(_groups(self.network, recipe.rate, start.init is not None))
