@@ -52,7 +52,7 @@ class ExportQuery(Look):
 
     time: float | None = Field(None, ge=-0.5, le=1e6)  # type: ignore[assignment]
     size: int = Field(512, ge=32, le=LARGEST_VIDEO)
-    background: Literal["black", "white"] = "white"  # type: ignore[assignment]
+    background: Literal["black", "white"] = "white"
     format: Literal["mp4", "webm", "gif"] = "mp4"
     pictures: int = Field(96, ge=2, le=240, description="of one turn, 24 a second")
     moving: bool = True

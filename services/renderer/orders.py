@@ -78,8 +78,8 @@ class Desk:
         return MIMES[order["format"]], write_turntable(self.replay(order["source"]), turntable, order["format"])
 
     def _figure(self, order: Mapping[str, Any]) -> tuple[str, bytes]:
-        from rsavatar.report.figures import Figure
         from rsavatar.report.figures_draw import draw
+        from rsavatar.report.runs import Figure
 
         figure = Figure.from_json(order["figure"])
         pictures = self._pictures(order) if figure.pictures else {}
