@@ -16,7 +16,6 @@ from rsavatar.data import build_work
 from rsavatar.data.base import Array, Bytes
 from rsavatar.data.build import Settings, build
 from rsavatar.data.build_card import readable
-from rsavatar.data.build_files import distorted_rows, lens_shift
 from rsavatar.data.build_motion import displacements
 from rsavatar.data.build_plan import Clock
 from rsavatar.data.build_table import SUBJECTS, build_all
@@ -111,7 +110,7 @@ def test_rows_of_the_raw_picture_carry_the_time_of_a_real_sensor(bent: Footage, 
         grey(root / "rs/images/04/000000.png"), np.repeat(BENT * times[:, None], 64, 1), atol=0.6
     )
     rgb, coverage = load(root).observe("04", 0)
-    where = distorted_rows(bent, "04")
+    where = bent.lens("04").raw_rows((64, 64))
     seen = cv2.erode(coverage, np.ones((5, 5), np.uint8)) > 250
     wanted = BENT * (7 + 5 * (where / 64 - 0.5))
     np.testing.assert_allclose(
@@ -119,7 +118,7 @@ def test_rows_of_the_raw_picture_carry_the_time_of_a_real_sensor(bent: Footage, 
     )  # rounded twice, and undistorted on a grid of 1/32
     assert np.abs(wanted - BENT * times[:, None])[seen].max() > 1  # and that is not the undistorted row's
     card = json.loads((root / "benchmark.json").read_text())
-    assert card["lens_shift_rows"] == pytest.approx(lens_shift(bent, "04"), abs=1e-9)
+    assert card["lens_shift_rows"] == pytest.approx(bent.lens("04").row_shift((64, 64)), abs=1e-9)
     assert card["lens_shift_rows"] > 1
     assert "the model's clock, which follows undistorted rows, is off" in readable(card)
 

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from rsavatar.cli import main
+from rsavatar.data.catalogue import open_subject
+from rsavatar.data.check import check, render
 from rsavatar.data.convert import convert
 from rsavatar.data.easymocap import to_smplx
 from rsavatar.data.footage import Footage
@@ -23,6 +25,7 @@ from tests.core.footage_files import (
     write_own_footage,
     write_zju_footage,
 )
+from tests.core.subject_files import write_rolling, write_zju
 
 FRAMES = 9
 PAINT = clock_picture(24, 20)
@@ -186,3 +189,33 @@ def test_the_command_line_builds_and_converts(own: Path, tmp_path: Path, capsys:
         == 0
     )
     assert load(tmp_path / "rs2").timing.trigger("01") == -0.25
+
+
+def test_our_folder_is_a_sharp_subject_too(own: Path) -> None:
+    subject = open_subject("mine", own)
+    assert (subject.training, subject.held_out, subject.frames) == (("00", "01"), ("02",), FRAMES)
+    assert subject.timing.readout_frames == 0
+    assert (subject.observe("02", 3)[0] == 60).all()
+    assert len(subject.fingerprint) == 64
+
+
+def test_check_looks_at_our_folder(tmp_path: Path) -> None:
+    """The drawn figure, converted: sound; with metres times a thousand in its fits: named."""
+    sound = write_zju(tmp_path / "zju").root
+    root = convert(open_footage(sound), tmp_path / "mine")
+    report = check(root)
+    assert report.ok, render(report)
+    with np.load(root / "fits.npz") as held:
+        values = {name: held[name] for name in held.files}
+    np.savez(root / "fits.npz", **(values | {"Th": 1000 * values["Th"]}))
+    assert "Th of the fits is in millimetres" in render(check(root))
+
+
+def test_check_says_when_distorted_rows_carry_the_time(tmp_path: Path) -> None:
+    lens = np.array([-0.2, 0.03, 0, 0, 0])
+    report = check(write_rolling(tmp_path / "bent", D=lens).root)
+    rows = [finding for finding in report.findings if finding.what == "rows"]
+    assert [finding.severity for finding in rows] == ["warning"]
+    assert "off by up to" in rows[0].got
+    straight = check(write_rolling(tmp_path / "straight").root)
+    assert [finding.severity for finding in straight.findings if finding.what == "rows"] == ["ok"]

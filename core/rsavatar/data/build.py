@@ -22,7 +22,7 @@ from typing import Any, Literal
 from rsavatar.body.find import find_body
 from rsavatar.data.base import BodyFit
 from rsavatar.data.build_card import CARD, write_card
-from rsavatar.data.build_files import lens_shift, write_annots, write_fits, write_meta
+from rsavatar.data.build_files import write_annots, write_fits, write_meta
 from rsavatar.data.build_fit import mid_fit, seen_fit
 from rsavatar.data.build_plan import Clock, trigger_offsets
 from rsavatar.data.build_work import Crew, Work
@@ -121,7 +121,7 @@ def card_of(
     footage, clock = work.footage, work.clock
     cameras = {"train": list(footage.train), "test": list(footage.test), "excluded": list(footage.excluded)}
     recursion = work.interpolator[2]
-    shift = max(lens_shift(footage, camera) for camera in work.cameras())
+    shift = max(footage.lens(camera).row_shift(footage.size(camera)) for camera in work.cameras())
     height = footage.size(footage.train[0])[0]
     late = sum(1 for value in work.triggers.values() if value != int(value))
     return {

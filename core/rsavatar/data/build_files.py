@@ -7,34 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from rsavatar.data.base import BodyFit
 from rsavatar.data.build_work import Work
-from rsavatar.data.footage import Footage
 from rsavatar.data.rolling import name_of
-
-
-def lens_shift(footage: Footage, camera: str) -> float:
-    """Largest distance, in rows, that the lens moves a point of the ideal picture by; 0 without distortion."""
-    lens = footage.calibrations[footage.index[camera]].lens(footage.pixel_centre)
-    if not lens.distorts:
-        return 0.0
-    return float(np.abs(distorted_rows(footage, camera) - np.arange(footage.size(camera)[0])[:, None]).max())
-
-
-def distorted_rows(footage: Footage, camera: str) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    """For every pixel [H, W] of the undistorted picture, the row of the raw picture that shows it (pixel indices).
-
-    That row's time is when a real sensor exposed it.
-    """
-    lens = footage.calibrations[footage.index[camera]].lens(footage.pixel_centre)
-    height, width = footage.size(camera)
-    x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3) @ np.linalg.inv(lens.matrix).T
-    pixels = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), lens.matrix, lens.distortion)[0]
-    return np.asarray(pixels.reshape(height, width, 2)[..., 1], np.float64)
 
 
 def write_annots(work: Work) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from rsavatar.catalog import DATASETS
@@ -10,23 +11,34 @@ from rsavatar.data.base import Subject
 from rsavatar.errors import DataError, expected
 
 STUDIO = "studio"
-_LAYOUTS = "meta.json with rs/ (rolling), or annots.npy with images/ or Camera_B1.. (zju)"
+_STUDIO = re.compile(r"studio(?:-(0|[1-9]\d{0,8}))?$")  # "studio" is that of seed 0
+_LAYOUTS = "meta.json with rs/ (rolling), footage.json (footage), or annots.npy with images/ or Camera_B1.. (zju)"
 
 
 def open_subject(name: str, directory: Path | None) -> Subject:
-    """The subject in ``directory``; without one, ``name`` must be the built-in "studio", which is built when absent.
+    """The subject in ``directory``; without one, ``name`` must be built in, and is built when absent.
+
+    Built in are "studio" and, for every seed N, "studio-N".
 
     Raises:
         DataError: if there is no folder, it has no known layout, or the subject cannot be read.
     """
     if directory is None:
-        if name != STUDIO:
-            raise DataError(expected(f"subject {name!r}", f"a folder, or the built-in {STUDIO!r}", "no folder"))
+        seed = studio_seed(name)
+        if seed is None:
+            wanted = f"a folder, or the built-in {STUDIO!r} or '{STUDIO}-N'"
+            raise DataError(expected(f"subject {name!r}", wanted, "no folder"))
         from rsavatar.data.studio import studio_subject_dir
 
-        directory = studio_subject_dir()
+        directory = studio_subject_dir(seed)
     subject: Subject = load_named(DATASETS, layout_of(directory))(directory)
     return subject
+
+
+def studio_seed(name: str) -> int | None:
+    """The seed of a built-in subject's name; None for all other names."""
+    match = _STUDIO.fullmatch(name)
+    return int(match[1] or 0) if match else None
 
 
 def layout_of(directory: Path) -> str:
@@ -39,6 +51,8 @@ def layout_of(directory: Path) -> str:
         raise DataError(expected(str(directory), "a subject's folder", "nothing there"))
     if (directory / "meta.json").is_file() and (directory / "rs").is_dir():
         return "rolling"
+    if (directory / "footage.json").is_file():
+        return "footage"
     pictures = (directory / "images").is_dir() or any(directory.glob("Camera*"))
     if (directory / "annots.npy").is_file() and pictures:
         return "zju"

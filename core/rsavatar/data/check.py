@@ -21,8 +21,10 @@ from rsavatar.data.consistency import (
     check_timing,
 )
 from rsavatar.data.findings import Finding, Report, Severity, render
+from rsavatar.data.footage import read_own
 from rsavatar.data.images import Lens
 from rsavatar.data.mistakes import AS_GIVEN, Diagnosis, diagnose, mean_iou, trial_of
+from rsavatar.data.rolling import name_of
 from rsavatar.data.silhouettes import Score
 from rsavatar.data.zju import camera_folders
 from rsavatar.errors import BodyError, DataError
@@ -51,7 +53,8 @@ def check(root: Path, body: str = "auto") -> Report:
         findings += _check_absent(root, layout, subject)
         pairs = _sample(subject)
         findings += check_masks(subject, pairs)
-        findings += _check_projection(subject, _lenses(root, layout), body, pairs)
+        lenses = _lenses(root, layout)
+        findings += [*_check_rows(subject, lenses), *_check_projection(subject, lenses, body, pairs)]
     except (DataError, BodyError) as error:
         findings.append(_failure(error))
     return Report(root, tuple(findings))
@@ -60,6 +63,8 @@ def check(root: Path, body: str = "auto") -> Report:
 def _picture_folders(root: Path, layout: str) -> list[Path]:
     if layout == "rolling":
         return [root / "rs"]
+    if layout == "footage":
+        return [root / "images", root / "masks"]
     return [folder for folders in camera_folders(root).values() for folder in (folders.images, folders.masks)]
 
 
@@ -112,9 +117,28 @@ def _lively(fit: BodyFit) -> list[int]:
 
 
 def _lenses(root: Path, layout: str) -> dict[str, Lens]:
+    if layout == "footage":
+        footage = read_own(root)
+        return {name_of(footage.index[name]): footage.lens(name) for name in (*footage.train, *footage.test)}
     path = root / "rs" / "annots.npy" if layout == "rolling" else root / "annots.npy"
     # Half a pixel of the principal point moves no diagnosis.
     return {f"{index:02d}": each.lens(0.5) for index, each in enumerate(read_calibrations(path))}
+
+
+def _check_rows(subject: Subject, lenses: Mapping[str, Lens]) -> list[Finding]:
+    """The model's clock follows undistorted rows; pictures that a real sensor read have theirs on distorted ones."""
+    if subject.timing.readout_frames == 0:
+        return []
+    sizes = {name: (camera.height, camera.width) for name, camera in subject.cameras.items()}
+    parts = {name: lenses[name].row_shift(sizes[name]) / sizes[name][0] for name in subject.training}
+    worst = max(parts, key=lambda name: parts[name])
+    wanted = "rows that carry the time where the model looks for them"
+    if not parts[worst]:
+        return [Finding("ok", "rows", wanted, "pictures without distortion")]
+    late = parts[worst] * subject.timing.readout_frames
+    got = f"distorted pictures: in camera {worst} a row's time is off by up to {late:.2f} source frames"
+    hint = "the lens moves rows after they were read; footage can be built with --rows undistorted"
+    return [Finding("warning", "rows", wanted, got, hint)]
 
 
 def _check_projection(subject: Subject, lenses: Mapping[str, Lens], body: str, pairs: Sequence[Pair]) -> list[Finding]:

@@ -25,7 +25,7 @@ import numpy as np
 from rsavatar.data import easymocap
 from rsavatar.data.annots import Calibration, numbers
 from rsavatar.data.base import Array, BodyFit, Bytes
-from rsavatar.data.images import Frame, fingerprint, locate, numbered, read_coverage, read_rgb, size_of
+from rsavatar.data.images import Frame, Lens, fingerprint, locate, numbered, read_coverage, read_rgb, size_of
 from rsavatar.errors import DataError, expected
 
 DESCRIPTION = "footage.json"
@@ -64,6 +64,10 @@ class Footage:
         """(height, width) of a camera's pictures."""
         return size_of(self.frames[camera][0].image)
 
+    def lens(self, camera: str) -> Lens:
+        """A camera's lens, as OpenCV takes it."""
+        return self.calibrations[self.index[camera]].lens(self.pixel_centre)
+
     def fingerprint(self, cameras: Sequence[str]) -> str:
         """sha256 of all that the pictures of ``cameras``, the calibration and the fits hold."""
         pictures = [path for name in cameras for frame in self.frames[name] for path in (frame.image, frame.mask)]
@@ -82,7 +86,7 @@ class Footage:
         if self.labelled:
             coverage = np.where(coverage != 0, 255, 0).astype(np.uint8)
         if undistorted:
-            lens = self.calibrations[self.index[camera]].lens(self.pixel_centre)
+            lens = self.lens(camera)
             colours, coverage = lens.undistorted(colours), lens.undistorted(coverage)
             if self.labelled:
                 coverage = np.where(coverage >= 128, 255, 0).astype(np.uint8)

@@ -40,6 +40,23 @@ class Lens:
         matrix[:2, 2] -= 0.5
         return Lens(matrix, self.distortion)
 
+    def raw_rows(self, size: tuple[int, int]) -> Array:
+        """For every pixel [H, W] of the undistorted picture, the row of the raw one that shows it (pixel indices).
+
+        That row's time is when a real sensor exposed it.
+        """
+        height, width = size
+        x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+        rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3) @ np.linalg.inv(self.matrix).T
+        pixels = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), self.matrix, self.distortion)[0]
+        return np.asarray(pixels.reshape(height, width, 2)[..., 1], np.float64)
+
+    def row_shift(self, size: tuple[int, int]) -> float:
+        """The largest distance, in rows, between a pixel and where the raw picture shows it; 0 without distortion."""
+        if not self.distorts:
+            return 0.0
+        return float(np.abs(self.raw_rows(size) - np.arange(size[0])[:, None]).max())
+
     def undistorted(self, image: Bytes) -> Bytes:
         """The image an ideal pinhole camera of the same matrix would have taken (bilinear, black outside)."""
         if not self.distorts:
