@@ -20,12 +20,6 @@ static void sort_by_depth(Slot &slot) {
     }
 }
 
-struct Projected {
-    const float *base;
-    size_t stride;
-    float operator()(Field f, int i) const { return base[f * stride + i]; }
-};
-
 static int16_t first_centre(float edge, int lo, int hi) { return (int16_t)std::ceil(std::clamp(edge - 0.5f, (float)lo, (float)hi)); }
 
 // Keeps the Gaussians that can reach a pixel of the slot. Comparisons are written so that NaN is dropped.
@@ -98,9 +92,8 @@ void resort(const RsFrame &frame, Slot &slot, int strip) {
     if (moves > MOST_MOVES * n) merge(key, entry, pair);
 }
 
-void bin(RsFrame &frame, int index, int count) {
+void bin(RsFrame &frame, int index, int count, const Projected &p) {
     Slot &slot = frame.slots[index];
-    Projected p{slot.scratch.data(), slot.scratch.size() / FIELDS};
     cull(frame, slot, count, p);
     sort_by_depth(slot);
     int n = slot.ids.size(), lo = slot.rows.lo, height = frame.options.strip_rows;

@@ -23,7 +23,7 @@ static_assert(sizeof(Splat) == 64, "one cache line");
 // coordinates x = dx + tilt dy and y = dy.
 enum Moment { M0, MX, MY, MXX, MXY, MYY, MR, MG, MB, MOMENTS };
 
-// Projected Gaussians of one slot before culling, structure of arrays [FIELDS][stride].
+// What is projected of a Gaussian, before culling.
 enum Field { U, V, QXX, TILT, QYY, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH, DEPTH_RATE, TAU, HALF_X, HALF_Y, FIELDS };
 
 constexpr float BEHIND = -1.f, BROKEN = -2.f;  // in place of a depth
@@ -41,7 +41,6 @@ struct Slot {
     std::vector<int16_t> strip_x_lo, strip_x_hi;  // columns that the strip's splats reach
     std::vector<int32_t> entry_splat, entry_pair;  // the strips' lists, by depth
     std::vector<float> moments;        // [pairs][16], written by the backward raster
-    std::vector<float> scratch;        // [FIELDS][stride]
     std::vector<uint32_t> keys, keys2;
     std::vector<int32_t> order, order2;
 };
@@ -58,11 +57,19 @@ struct RsFrame {
     std::vector<Slot> slots;           // capacity is kept between images: slots[0, slot_count) are in use
     std::vector<Group> groups;
     std::vector<std::pair<int, int>> tasks;  // (group, strip)
+    std::vector<float> scratch;        // [FIELDS][stride] of the only slot; of several, each thread has its own
     std::vector<float> pose_sums;      // [chunks][T][D * 24 * 12]
 };
 
-void project(RsFrame &frame, const RsGaussians &gaussians, const float *pose, int slot, int begin, int end);
-void bin(RsFrame &frame, int slot, int count);
+// A slot's projected Gaussians before culling, structure of arrays.
+struct Projected {
+    float *base;
+    size_t stride;
+    float operator()(Field f, int i) const { return base[f * stride + i]; }
+};
+
+void project(const RsFrame &frame, const RsGaussians &gaussians, const float *pose, int slot, int begin, int end, const Projected &out);
+void bin(RsFrame &frame, int slot, int count, const Projected &projected);
 void resort(const RsFrame &frame, Slot &slot, int strip);
 void raster(RsFrame &frame, float *rgb, float *transmittance);
 void raster_backward(RsFrame &frame, const float *rgb, const float *transmittance, const float *grad_rgb,

@@ -48,7 +48,7 @@ static Ints finite(const Block &block, const RsGaussians &g, const Posed &p, con
     return ((Ints)all & 0x7f800000) != 0x7f800000;
 }
 
-static void project_block(const RsFrame &frame, const RsGaussians &g, const float *pose, int first, Slot &slot) {
+static void project_block(const RsFrame &frame, const RsGaussians &g, const float *pose, int first, const Slot &slot, const Projected &projected) {
     const RsCamera &cam = frame.camera;
     const RsOptions &o = frame.options;
     int D = frame.coefficients;
@@ -82,14 +82,13 @@ static void project_block(const RsFrame &frame, const RsGaussians &g, const floa
     out[DEPTH] = select(finite(block, g, p, f, s), select(p.in_front, p.camera.z, splat(BEHIND)), splat(BROKEN));
     out[DEPTH_RATE] = p.velocity.z, out[TAU] = tau;
     out[HALF_X] = half_x, out[HALF_Y] = half_y;
-    size_t stride = slot.scratch.size() / FIELDS;
-    for (int k = 0; k < FIELDS; k++) store(slot.scratch.data() + k * stride + first, out[k]);
+    for (int k = 0; k < FIELDS; k++) store(projected.base + k * projected.stride + first, out[k]);
 }
 
-void project(RsFrame &frame, const RsGaussians &g, const float *pose, int index, int begin, int end) {
-    Slot &slot = frame.slots[index];
+void project(const RsFrame &frame, const RsGaussians &g, const float *pose, int index, int begin, int end, const Projected &out) {
+    const Slot &slot = frame.slots[index];
     const float *slot_pose = pose + (size_t)index * frame.coefficients * JOINTS * 12;
-    for (int first = begin; first < end; first += LANES) project_block(frame, g, slot_pose, first, slot);
+    for (int first = begin; first < end; first += LANES) project_block(frame, g, slot_pose, first, slot, out);
 }
 
 // ---- backward ---------------------------------------------------------------------------------------------------------
