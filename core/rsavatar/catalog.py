@@ -27,6 +27,8 @@ DATASETS: dict[str, str] = {
     "footage": "rsavatar.data.sharp:load",
 }
 
+STUDIO_NAME = r"studio(?:-(?P<seed>0|[1-9][0-9]{0,8}))?"  # built-in subjects; "studio" is that of seed 0
+
 METRICS: dict[str, str] = {
     "psnr": "rsavatar.metrics.image:psnr",
     "ssim": "rsavatar.metrics.image:ssim",

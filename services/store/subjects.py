@@ -1,13 +1,15 @@
-"""Subjects that jobs may name. ``studio`` always exists: the core makes it itself."""
+"""Subjects that jobs may name. ``studio`` and ``studio-N`` always exist: the core makes them itself."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 
 from sqlalchemy import select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
+from rsavatar.catalog import STUDIO_NAME
 from services.errors import ConflictError, NotFoundError
 from services.store.records import TERMINAL, Subject, SubjectState
 from services.store.session import Store, db_now
@@ -47,6 +49,8 @@ def look(store: Store, name: str) -> Subject:
         row = session.get(SubjectRow, name)
         if row is not None:
             return _subject(row)
+    if re.fullmatch(STUDIO_NAME, name):
+        return Subject(name, STUDIO.path, STUDIO.kind, STUDIO.info)
     raise NotFoundError("subject", f"one of {', '.join(s.name for s in all_of(store))}", repr(name))
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from rsavatar.catalog import DATASETS
+from rsavatar.catalog import DATASETS, STUDIO_NAME
 from rsavatar.catalog import load as load_named
 from rsavatar.data.base import Subject
 from rsavatar.errors import DataError, expected
 
 STUDIO = "studio"
-_STUDIO = re.compile(r"studio(?:-(0|[1-9]\d{0,8}))?$")  # "studio" is that of seed 0
 _LAYOUTS = "meta.json with rs/ (rolling), footage.json (footage), or annots.npy with images/ or Camera_B1.. (zju)"
 
 
@@ -37,8 +36,8 @@ def open_subject(name: str, directory: Path | None) -> Subject:
 
 def studio_seed(name: str) -> int | None:
     """The seed of a built-in subject's name; None for all other names."""
-    match = _STUDIO.fullmatch(name)
-    return int(match[1] or 0) if match else None
+    match = re.fullmatch(STUDIO_NAME, name)
+    return int(match["seed"] or 0) if match else None
 
 
 def layout_of(directory: Path) -> str:
