@@ -11,6 +11,7 @@ two processes never write one checkpoint. A lock on the folder makes sure of it.
 
 from __future__ import annotations
 
+import contextlib
 import faulthandler
 import fcntl
 import json
@@ -127,8 +128,9 @@ def serve(run: Run) -> int:
     except errors.Interrupted:
         channel.send({"kind": "interrupted"})
     except Exception as error:
-        traceback.print_exc()
         channel.send(describe(error))
+        with contextlib.suppress(OSError):  # the log may lie on the disk that is full
+            traceback.print_exc()
         return 1
     return 0
 

@@ -65,14 +65,14 @@ class Host:
             env[f"RSAVATAR_{name.upper()}"] = json.dumps(value) if isinstance(value, list) else str(value)
         return env
 
-    def start(self, name: str) -> subprocess.Popen[bytes]:
-        """Start ``redis``, ``api`` or ``worker`` and wait until it serves."""
-        command = redis_server.command(self.settings) if name == "redis" else COMMANDS[name]
+    def start(self, name: str, **env: str) -> subprocess.Popen[bytes]:
+        """Start ``redis``, ``api`` or ``worker`` (also ``worker-2``, ...) and wait until it serves."""
+        command = redis_server.command(self.settings) if name == "redis" else COMMANDS[name.partition("-")[0]]
         with (self.settings.home / "logs" / f"{name}.log").open("ab") as log:
             process = subprocess.Popen(
                 command,
                 cwd=ROOT,
-                env=self.env,
+                env=self.env | env,
                 stdout=log,
                 stderr=log,
                 preexec_fn=terminate_with_parent,  # noqa: PLW1509  (nothing in these tests forks in a thread)
@@ -96,6 +96,14 @@ class Host:
         process.send_signal(signal.SIGKILL)
         process.wait()
 
+    def name_of(self, pid: int) -> str:
+        """Which of our processes has this pid."""
+        return next(name for name, process in self._processes.items() if process.pid == pid)
+
+    def signal(self, name: str, signum: int) -> None:
+        """Send a signal."""
+        self._processes[name].send_signal(signum)
+
     def stop(self, name: str) -> int:
         """SIGTERM; returns the exit status."""
         process = self._processes.pop(name)
@@ -104,6 +112,8 @@ class Host:
 
     def close(self) -> None:
         """End everything."""
+        for process in self._processes.values():
+            process.send_signal(signal.SIGCONT)
         for name in list(self._processes)[::-1]:
             self.stop(name)
         self.client.close()

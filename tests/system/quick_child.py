@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import resource
 import signal
 import sys
 import time
@@ -22,7 +23,7 @@ from rsavatar.spec import JobSpec
 from services.worker.child import serve
 
 STEP_SECONDS = 0.01
-KILLS_ITSELF_ONCE, DIVERGES, HAS_A_BUG, HANGS, ALWAYS_DIES = 101, 102, 103, 104, 105
+KILLS_ITSELF_ONCE, DIVERGES, HAS_A_BUG, HANGS, ALWAYS_DIES, EATS_MEMORY, FILLS_DISK = 101, 102, 103, 104, 105, 106, 107
 PNG = bytes.fromhex(
     "89504e470d0a1a0a0000000d4948445200000001000000010804000000b51c0c02"
     "0000000b4944415478da6364f80f00010501012718e3660000000049454e44ae426082"
@@ -48,6 +49,15 @@ def misbehave(spec: JobSpec, out: Path, step: int) -> None:
         raise ZeroDivisionError("division by zero")
     if spec.seed == HANGS:
         time.sleep(600)
+    if spec.seed == EATS_MEMORY:
+        hoard = bytearray(300 << 20)
+        hoard[::4096] = b"x" * len(hoard[::4096])
+        time.sleep(600)
+    if spec.seed == FILLS_DISK and not (out / "filled").exists():
+        (out / "filled").touch()
+        resource.setrlimit(
+            resource.RLIMIT_FSIZE, (16, resource.RLIM_INFINITY)
+        )  # the next file breaks off, as on a full disk
 
 
 def newest(*checkpoints: Path) -> tuple[int, str]:
@@ -60,7 +70,7 @@ def count(
     spec: JobSpec, out: Path, subject_dir: Path | None, report: events.Report, should_stop: Callable[[], bool]
 ) -> Count:
     checkpoint = out / "checkpoint.json"
-    step, state = newest(checkpoint, out / "checkpoint.stored")
+    step, state = newest(checkpoint, out / "checkpoint.before.json", out / "checkpoint.stored")
     print("a stray print must not break the protocol")
     report(events.Note(f"starting at step {step}"))
     started = time.monotonic()
@@ -72,6 +82,8 @@ def count(
         if step % spec.checkpoint_every == 0 or should_stop():
             partial = out / "checkpoint.part"
             partial.write_text(json.dumps([step, state]))
+            if checkpoint.exists():
+                checkpoint.replace(out / "checkpoint.before.json")
             partial.replace(checkpoint)
             report(events.Checkpointed(step, str(checkpoint), hashlib.sha256(checkpoint.read_bytes()).hexdigest()))
         if should_stop():
