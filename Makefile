@@ -4,12 +4,14 @@
 # make check  format, lint, types, import contracts
 # make check-native  the kernels under address, undefined-behaviour and thread sanitizers
 # make bench  the long measurements; results in docs/benchmarks
+# make studies  ablation, calibration, exposure, losses, robustness, superres: hours; JOBS=N at a time, SUBJECTS='DIR ...'
 
 PYTHON ?= python3
 BIN := .venv/bin
 SETUP := .venv/.complete
+JOBS ?= 1
 
-.PHONY: setup demo up test check check-native bench clean
+.PHONY: setup demo up test check check-native bench clean studies
 .DEFAULT_GOAL := help
 
 help:
@@ -47,6 +49,12 @@ bench: $(SETUP)
 	$(BIN)/rsavatar bench growth --json docs/benchmarks/growth.json
 	$(BIN)/rsavatar bench train --json docs/benchmarks/train.json
 	$(BIN)/rsavatar bench stability --json docs/benchmarks/stability.json
+
+studies: $(SETUP)
+	for name in ablation calibration losses robustness superres; do \
+		$(BIN)/rsavatar bench $$name --jobs $(JOBS) $(if $(SUBJECTS),--subjects $(SUBJECTS)) --json docs/benchmarks/$$name.json || exit 1; \
+	done
+	$(BIN)/rsavatar bench exposure --jobs $(JOBS) --json docs/benchmarks/exposure.json
 
 clean:
 	rm -rf .venv build core/*.egg-info core/rsavatar/render/_kernels_*.so

@@ -64,7 +64,7 @@ def test_the_ablation_study_has_every_flag_and_sweep_of_the_paper() -> None:
 
 def result(*runs: tuple[str, str, int, float]) -> StudyResult:
     found = [Run(variant=v, subject=s, seed=k, spec_sha256="x", values={"psnr": p}) for v, s, k, p in runs]
-    return StudyResult(name="tiny", command="c", machine=MACHINE, preset="draft", iterations=20, runs=found)
+    return StudyResult(name="tiny", command="c", machine=MACHINE, code="c", preset="draft", iterations=20, runs=found)
 
 
 def test_the_page_has_means_paired_differences_and_what_others_report() -> None:

@@ -7,6 +7,7 @@ not depend on the number of processes: training does not depend on the number of
 
 from __future__ import annotations
 
+import hashlib
 import multiprocessing
 import os
 import re
@@ -14,6 +15,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -21,6 +23,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, ValidationError
 from rich.console import Console
 
+import rsavatar
 from rsavatar import experiment
 from rsavatar.bench.machine import Machine, describe
 from rsavatar.data.studio import studio_subject_dir
@@ -98,6 +101,7 @@ class StudyResult(BaseModel):
     name: str
     command: str
     machine: Machine
+    code: str  # sha256 of the package's sources: runs of other code are not gone on from
     preset: str
     iterations: int
     runs: list[Run]
@@ -169,7 +173,7 @@ def main(module: str, request: Request) -> int:
     study: Study = import_module(module).STUDY
     console, machine = Console(), describe()
     jobs = _jobs(module, study, request)
-    kept = _kept(request.json, study, machine, jobs)
+    kept = _kept(request.json, study, jobs)
     left = [job for job in jobs if job not in kept]
     runs = dict(kept)
     console.print(f"{study.title}: {len(jobs)} jobs, {len(left)} to run, {request.jobs} at a time")
@@ -198,7 +202,7 @@ def _jobs(module: str, study: Study, request: Request) -> list[Job]:
     ]
 
 
-def _kept(path: Path | None, study: Study, machine: Machine, jobs: Sequence[Job]) -> dict[Job, Run]:
+def _kept(path: Path | None, study: Study, jobs: Sequence[Job]) -> dict[Job, Run]:
     """Runs of an earlier, cut call: of the same code and specs, without error."""
     if path is None or not path.is_file():
         return {}
@@ -206,11 +210,21 @@ def _kept(path: Path | None, study: Study, machine: Machine, jobs: Sequence[Job]
         before = StudyResult.model_validate_json(path.read_text())
     except ValidationError:
         return {}
-    if before.machine.commit != machine.commit or machine.commit.endswith(("+", "unknown")):
+    if before.code != code_sha256():
         return {}
     found = {(r.variant, r.subject, r.seed, r.spec_sha256): r for r in before.runs if not r.error}
     keys = {job: (job.variant, place(job.subject)[0], job.seed, job.spec(study).sha256()) for job in jobs}
     return {job: found[key] for job, key in keys.items() if key in found}
+
+
+@cache
+def code_sha256() -> str:
+    """Of every file of the package that can change a figure."""
+    digest, package = hashlib.sha256(), Path(rsavatar.__file__).parent
+    for path in sorted([*package.rglob("*.py"), *package.rglob("*.so")]):
+        digest.update(path.relative_to(package).as_posix().encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def _run_all(jobs: Sequence[Job], processes: int) -> Iterator[tuple[Job, Run]]:
@@ -228,6 +242,7 @@ def _write(study: Study, request: Request, machine: Machine, runs: list[Run]) ->
         name=study.name,
         command=command(study, request),
         machine=machine,
+        code=code_sha256(),
         preset=request.preset,
         iterations=preset.iterations,
         runs=runs,
