@@ -80,7 +80,7 @@ def get_export(
     back: Back,
     if_none_match: Tag = None,
 ) -> Response:
-    """``ply``: the Gaussians in 3D Gaussian splatting's layout, canonical or posed at ``time``. ``turntable``: a video."""
+    """``ply``: Gaussians in the layout of 3D Gaussian splatting, canonical or at ``time``. ``turntable``: a video."""
     job = jobs.get(back.store, job_id)
     source = source_of(back, job_id)
     stem = f"{job.subject}-{job.method}".replace("+", "-")

@@ -136,9 +136,11 @@ def _shutter(runs: Sequence[Run], wish: Wish) -> Figure:
     shown = _shown(runs, wish)
     caption = (
         "One body, four exposures. Global: one instant. Blur: the mean over the readout. Bands: the rows of each band "
-        "from one instant, with a seam between bands. Rolling: every row at its own instant. "
-        "Below, the same choice as a model of the sensor, against the number of bands T."
+        "from one instant, with a seam between bands. Rolling: every row at its own instant. Enlarged where global and "
+        "rolling differ most."
     )
+    if len({s["bands"] for s in sweep} - {"scanline"}) > 1:
+        caption += " Below, the same choice as a model of the sensor, against the number T of its instants."
     lacking = "" if shown else "a succeeded job of rs-avatar"
     pictures = {"kind": "shutter", "job": shown.job_id, "subject": shown.subject, "frame": wish.frame} if shown else {}
     used = [*modelled, *([shown] if shown else [])]
