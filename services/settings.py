@@ -154,11 +154,32 @@ def read_settings() -> Settings:
         SettingsError: naming the variable, what was expected and what was got.
     """
     try:
-        return Settings()
+        return Settings(**from_files())
     except ValidationError as error:
         first = error.errors()[0]
         name = "RSAVATAR_" + str(first["loc"][0]).upper()
         raise SettingsError(name, first["msg"].lower(), repr(first["input"])) from None
+
+
+def from_files() -> dict[str, str]:
+    """Settings whose value is a file's first line: ``RSAVATAR_X_FILE`` gives ``x``. Secrets are in no environment then.
+
+    Raises:
+        SettingsError: if the file cannot be read, or ``RSAVATAR_X`` is given as well.
+    """
+    found = {}
+    for name in Settings.model_fields:
+        variable = f"RSAVATAR_{name.upper()}"
+        path = os.environ.get(f"{variable}_FILE")
+        if path is None:
+            continue
+        if variable in os.environ:
+            raise SettingsError(variable, f"nothing, because {variable}_FILE is given", "a value")
+        try:
+            found[name] = Path(path).read_text("utf-8").partition("\n")[0].strip()
+        except OSError as error:
+            raise SettingsError(f"{variable}_FILE", "a readable file", f"{path} ({error.strerror})") from None
+    return found
 
 
 def make_home(settings: Settings) -> None:
