@@ -61,12 +61,6 @@ def csrf_of(secret: str) -> str:
     return hmac.new(secret.encode(), b"csrf", hashlib.sha256).hexdigest()
 
 
-def csrf(request: Request) -> str:
-    """What forms and scripts of a page send back; empty where no cookie vouches for the caller."""
-    caller = getattr(request.state, "caller", None)
-    return (caller.csrf or "") if isinstance(caller, Caller) else ""
-
-
 def caller_of(request: Request) -> Caller:
     """The caller, as the gate has found it.
 
@@ -79,7 +73,12 @@ def caller_of(request: Request) -> Caller:
     return caller
 
 
-Who = Annotated[Caller, Depends(caller_of)]
+async def known_caller(request: Request) -> Caller:
+    """``caller_of`` as a dependency: a plain function would cost a thread for every request."""
+    return caller_of(request)
+
+
+Who = Annotated[Caller, Depends(known_caller)]
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,8 @@ class Backend:
     intake: Intake
 
 
-def backend(request: Request) -> Backend:
-    """The application's backend."""
+async def backend(request: Request) -> Backend:
+    """The application's backend. No plain function: that would cost a thread for every request."""
     return cast(Backend, request.app.state.backend)
 
 

@@ -12,8 +12,9 @@ from services import jobs as wake_up
 from services.api.access import Who
 from services.api.deps import Back, JobId
 from services.api.intake import Wish
+from services.api.lines import page_of
 from services.api.requests import JobQuery, JobRequest, checked_key
-from services.api.views import ArtifactView, JobDetail, JobPage, JobView, ResultView
+from services.api.views import ArtifactView, JobDetail, JobPage, ResultView
 from services.store import artifacts, jobs, labels, listing, metrics
 from services.store.records import Filters, Job, State
 from services.store.session import Store
@@ -53,17 +54,16 @@ async def submit(
     return JobDetail.of(job)
 
 
-@router.get("")
-def list_jobs(query: Annotated[JobQuery, Query()], back: Back) -> JobPage:
+@router.get("", response_model=JobPage)
+def list_jobs(query: Annotated[JobQuery, Query()], back: Back) -> Response:
     """Jobs, newest first unless sorted otherwise; ``q`` is explained by ``GET /filters``."""
     filters = Filters(query.state, query.method, query.subject, query.grid, query.q)
     order = listing.Order(query.sort.removeprefix("-"), query.sort.startswith("-"))
-    found = listing.page(back.store, filters, order, query.cursor, query.limit + 1)
+    found = listing.lines(back.store, filters, order, query.cursor, query.limit + 1)
     shown = found[: query.limit]
-    is_last = len(found) <= query.limit
-    tags = labels.tags_of(back.store, [job.id for job in shown])
-    items = [JobView.of(job, tags.get(job.id, ())) for job in shown]
-    return JobPage(items=items, next_cursor=None if is_last else shown[-1].id)
+    next_cursor = None if len(found) <= query.limit else str(shown[-1]["id"])
+    tags = labels.tags_of(back.store, [str(row["id"]) for row in shown])
+    return Response(page_of(shown, tags, next_cursor), media_type="application/json")
 
 
 @router.get("/{job_id}")

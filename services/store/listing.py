@@ -6,11 +6,11 @@ what the first one does.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, func, select, tuple_
+from sqlalchemy import ColumnElement, Select, func, select, tuple_
 from sqlalchemy.orm import Session
 
 from services.store.filters import where
@@ -29,6 +29,30 @@ SORTS: dict[str, ColumnElement[Any]] = {
     "gaussians": func.coalesce(JobRow.gaussians, -1),
     "seconds": func.coalesce(JobRow.finished_at - JobRow.started_at, LOWEST),
 }
+LINE: tuple[str, ...] = (
+    "id",
+    "state",
+    "method",
+    "subject",
+    "priority",
+    "grid_id",
+    "owner",
+    "reused_from",
+    "attempt",
+    "failures",
+)
+LINE += (
+    "max_attempts",
+    "rss_bytes",
+    "cancel_requested_at",
+    "pause_requested_at",
+    "error_kind",
+    "error",
+    "stage",
+    "step",
+)
+LINE += ("steps", "loss", "psnr", "gaussians", "eta_seconds", "created_at", "started_at", "finished_at")
+WORDS = (JobRow.spec["preset"].as_string().label("preset"), JobRow.spec["iterations"].as_integer().label("iterations"))
 
 
 @dataclass(frozen=True)
@@ -41,14 +65,25 @@ class Order:
 
 def page(store: Store, filters: Filters, order: Order, after: str | None, limit: int) -> list[Job]:
     """Up to ``limit`` jobs that stand after the job ``after``; ids break ties, so that no row is lost or doubled."""
-    key = SORTS[order.key]
     with store.read() as session:
-        query = select(JobRow).where(*where(filters)).limit(limit)
-        if after is not None:
-            query = query.where(_beyond(session, order, after))
-        ends = [key] if key is SORTS["submitted"] else [key, JobRow.id]
-        query = query.order_by(*(end.desc() if order.descending else end.asc() for end in ends))
-        return [to_job(row) for row in session.scalars(query)]
+        query = _ordered(session, select(JobRow).where(*where(filters)), order, after)
+        return [to_job(row) for row in session.scalars(query.limit(limit))]
+
+
+def lines(store: Store, filters: Filters, order: Order, after: str | None, limit: int) -> list[Mapping[str, Any]]:
+    """``page`` as lists show it: a few columns and two words of the spec, which else stays in the database."""
+    columns = (JobRow.__table__.c[name] for name in LINE)
+    with store.read() as session:
+        query = _ordered(session, select(*columns, *WORDS).where(*where(filters)), order, after)
+        return [dict(row) for row in session.execute(query.limit(limit)).mappings()]
+
+
+def _ordered(session: Session, query: Select[Any], order: Order, after: str | None) -> Select[Any]:
+    key = SORTS[order.key]
+    if after is not None:
+        query = query.where(_beyond(session, order, after))
+    ends = [key] if key is SORTS["submitted"] else [key, JobRow.id]
+    return query.order_by(*(end.desc() if order.descending else end.asc() for end in ends))
 
 
 def _beyond(session: Session, order: Order, after: str) -> ColumnElement[bool]:

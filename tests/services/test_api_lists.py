@@ -5,6 +5,9 @@ from __future__ import annotations
 import httpx
 import pytest
 
+from services.api.views import JobPage, JobView
+from services.store import jobs, leases
+from services.store.records import Failure
 from services.store.session import Store
 from tests.services.test_api_jobs import UNKNOWN, finish, post
 
@@ -95,3 +98,16 @@ def test_curves_of_jobs_are_compared(client: httpx.Client, store: Store) -> None
     assert client.get("/api/v1/compare", params={"job": [first, first]}).status_code == 422
     assert client.get("/api/v1/compare").status_code == 422
     assert client.get("/api/v1/compare", params={"job": [UNKNOWN]}).status_code == 404
+
+
+def test_a_line_is_what_the_view_of_its_job_would_be(client: httpx.Client, store: Store) -> None:
+    made = [post(client, seed=seed).json()["id"] for seed in range(3)]
+    finish(store, 21.0)
+    claim = leases.claim(store, "test", 60.0)
+    assert claim is not None
+    leases.fail(store, claim, Failure.BAD_DATA, "mask: expected a picture, got nothing", 0.0)
+    client.patch(f"/api/v1/jobs/{made[2]}", json={"tags": ["a", "b"]})
+    page = client.get("/api/v1/jobs").json()
+    tags = {made[2]: ["a", "b"]}
+    views = [JobView.of(jobs.get(store, job), tags.get(job, ())) for job in made[::-1]]
+    assert page == JobPage(items=views, next_cursor=None).model_dump(mode="json")
