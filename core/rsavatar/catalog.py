@@ -41,6 +41,7 @@ STUDIES: dict[str, str] = {  # rsavatar bench NAME: many jobs, one table
     "calibration": "rsavatar.bench.calibration",
     "exposure": "rsavatar.bench.exposure",
     "losses": "rsavatar.bench.losses",
+    "restore": "rsavatar.bench.restore",
     "robustness": "rsavatar.bench.robustness",
     "skips": "rsavatar.bench.skips",
     "superres": "rsavatar.bench.superres",

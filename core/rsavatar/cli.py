@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from rsavatar import __version__, cli_data
+from rsavatar import __version__, cli_data, cli_restore
 from rsavatar.catalog import STUDIES
 from rsavatar.errors import RsAvatarError
 
@@ -175,6 +175,8 @@ def _add_local(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     check.add_argument("--body", default="auto", help="auto, anny, or an SMPL-format .npz or .pkl (default: auto)")
     check.add_argument("--json", action="store_true", help="the findings as one line of JSON")
     cli_data.add_verbs(nouns, _add)
+    correctors = verbs.add_parser("restore", help="train and score rolling-shutter correctors")
+    cli_restore.add_verbs(correctors.add_subparsers(required=True, metavar="VERB"), _add)
     studio = _add(
         nouns, "studio", "rsavatar.cli_local:studio", "make the built-in subject, without any download", STUDIO
     )

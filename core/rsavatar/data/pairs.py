@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rsavatar.data.base import Array, Subject
+from rsavatar.data.base import Array, Bytes, Subject
 from rsavatar.data.studio_stage import Stage, row_times, set_stage
 from rsavatar.errors import DataError, expected
 from rsavatar.events import Progress, Report, silent
@@ -48,7 +48,7 @@ def _takes_of(stage: Stage, wanted: StudioPairs, rng: np.random.Generator) -> li
     views = list(stage.cameras[: wanted.cameras])
     size = wanted.size
 
-    def drawn(times: Iterable[Array]) -> list[list[np.ndarray]]:  # type: ignore[type-arg]
+    def drawn(times: Iterable[Array]) -> list[list[Bytes]]:
         return [[rgb for rgb, _ in stage.pictures(views, clock)] for clock in times]
 
     rolling = drawn(row_times(mid, period, size) for mid in mids)

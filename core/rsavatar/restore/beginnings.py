@@ -41,8 +41,10 @@ def _begin_jamnet(network: JAMNet) -> None:
 
 def _hand_through(last: Decoder) -> None:
     """Output = second frame as fetched: input channels 3 to 5 through hidden channels 0 to 2."""
-    first, image = last.convrelu[0], last.predict_img
-    for conv in (first, image, *(block.conv_block[1].net[0] for block in last.resblocks.net)):
+    first, image = last.convrelu.get_submodule("0"), last.predict_img
+    assert isinstance(first, nn.Conv2d)
+    ends = [last.resblocks.get_submodule(f"net.{n}.conv_block.1.net.0") for n in range(len(last.resblocks.net))]
+    for conv in (first, image, *ends):
         _weaken(conv)
     for channel in range(3):
         first.weight[channel] = 0

@@ -9,6 +9,7 @@ others), holes between them are filled, and the picture is fetched along them on
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -66,13 +67,13 @@ class FlowCorrector(AbstractCorrector):
         if box is None or shot.gamma == 0:
             return shot.frame
         rows = len(coverage)
-        late = shot.gamma * (np.arange(rows, dtype=np.float32)[box[0], None] / rows - 0.5)
+        late = _field(shot.gamma * (np.arange(rows)[box[0], None] / rows - 0.5))
         seen = (coverage[box] > 0).astype(np.float32)
         steps = []
         for neighbour, sign in ((shot.before, -1.0), (shot.after, 1.0)):
             if neighbour is not None:
                 flow, trust = self._flow(rgb[box], neighbour[0][box])
-                steps.append(_Step(flow, trust * seen, sign + shot.gamma * flow[..., 1] / rows))
+                steps.append(_Step(flow, trust * seen, _field(sign + shot.gamma * flow[..., 1] / rows)))
         way, trust = ways(steps, -late, self._settings.parabola)
         moved = self._moved(filled(way, trust, self._settings.smooth), trust, rgb[box], coverage[box])
         whole = np.zeros_like(rgb), np.zeros_like(coverage)
@@ -102,8 +103,8 @@ class FlowCorrector(AbstractCorrector):
         lost = np.linalg.norm(forth + _fetched(back, forth), axis=-1)
         allowed = self._settings.slack * zoom + self._settings.tolerance * np.linalg.norm(forth, axis=-1)
         trust = np.exp(-np.square(lost / allowed)).astype(np.float32)
-        shrunk = [np.asarray(cv2.resize(x, (width, height), interpolation=cv2.INTER_AREA)) for x in (forth, trust)]
-        return shrunk[0] * np.float32([width / size[0], height / size[1]]), shrunk[1]
+        shrunk = [_field(cv2.resize(x, (width, height), interpolation=cv2.INTER_AREA)) for x in (forth, trust)]
+        return _field(shrunk[0] * np.array([width / size[0], height / size[1]])), shrunk[1]
 
     def _moved(self, way: Field, trust: Field, rgb: Bytes, coverage: Bytes) -> Picture:
         """The picture at the ends of its ways."""
@@ -133,7 +134,7 @@ def ways(steps: list[_Step], wanted: Field, parabola: float) -> tuple[Field, Fie
     weights = (both * parabola, a.trust * (1 - b.trust) + straight, b.trust * (1 - a.trust) + straight)
     total = weights[0] + weights[1] + weights[2]
     mixed = sum(w[..., None] * way for w, way in zip(weights, (bent, *lines), strict=True))
-    return (mixed / np.maximum(total, FLOOR)[..., None]).astype(np.float32), total
+    return _field(mixed / np.maximum(total, FLOOR)[..., None]), _field(total)
 
 
 def filled(field: Field, weight: Field, smooth: float) -> Field:
@@ -153,10 +154,14 @@ def filled(field: Field, weight: Field, smooth: float) -> Field:
 
 
 def _fetched(
-    image: npt.NDArray[np.generic], flow: Field, how: int = cv2.INTER_LINEAR, border: int = cv2.BORDER_REPLICATE
-) -> npt.NDArray[np.generic]:
+    image: npt.NDArray[Any], flow: Field, how: int = cv2.INTER_LINEAR, border: int = cv2.BORDER_REPLICATE
+) -> npt.NDArray[Any]:
     y, x = np.mgrid[: flow.shape[0], : flow.shape[1]].astype(np.float32)
     return np.asarray(cv2.remap(image, x + flow[..., 0], y + flow[..., 1], how, borderMode=border))
+
+
+def _field(values: Any) -> Field:
+    return np.asarray(values, np.float32)
 
 
 def _tensor(*fields: Field) -> Tensor:

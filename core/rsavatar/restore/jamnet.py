@@ -221,7 +221,7 @@ class Transformer(nn.Module):
         tokens = (x + sine_positions(x)).flatten(2).transpose(1, 2)
         for layer in self.layers:
             tokens = layer(tokens)
-        return tokens.transpose(1, 2).unflatten(2, (height, width))
+        return tokens.transpose(1, 2).reshape(len(x), -1, height, width)
 
 
 def sine_positions(x: Tensor, temperature: float = 10_000.0) -> Tensor:

@@ -6,6 +6,8 @@ backwards past a sensor that is read from below, which is the same picture; trai
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -14,7 +16,7 @@ from rsavatar.restore.base import AbstractCorrector, Bytes, Picture, Shot, on_bl
 from rsavatar.restore.cvr import CVR
 from rsavatar.restore.jamnet import JAMNet
 from rsavatar.restore.warp import backward_warp
-from rsavatar.restore.weights import Name, Origin, find, load
+from rsavatar.restore.weights import Name, Origin, files_of, find, load
 
 MARGIN = 32  # columns around the person that a network sees: outside, the picture is black
 MULTIPLES: dict[Name, int] = {"cvr": 64, "jamnet": 16}
@@ -74,13 +76,13 @@ class NetworkCorrector(AbstractCorrector):
         return result.image, result.carried(first, second)
 
 
-def network_corrector(model: Name) -> NetworkCorrector:
-    """With the user's weights, else with those that come with the package.
+def network_corrector(model: Name, weights: Path | None = None) -> NetworkCorrector:
+    """With ``weights`` (a file or folder), else the user's, else those that come with the package.
 
     Raises:
-        DataError: if the user's cannot be used.
+        DataError: if they cannot be used.
     """
-    network, origin = load(model, find(model))
+    network, origin = load(model, find(model) if weights is None else files_of(model, weights))
     return NetworkCorrector(model, network, origin)
 
 

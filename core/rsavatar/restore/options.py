@@ -24,6 +24,7 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--columns", type=int, default=192, help="width of the crops, a multiple of 64")
     parser.add_argument("--shrink", type=int, default=1, help="times smaller than the pairs are: fast first steps")
     parser.add_argument("--rate", type=float, default=1e-4, help="learning rate (default: the authors' 1e-4)")
+    parser.add_argument("--instants", type=int, default=3, help="CVR: instants in a step (default: 3)")
     parser.add_argument("--warmup", type=float, default=0.25, help="CVR from nothing: part that teaches its flow alone")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--held-out", type=int, default=8, help="takes to validate on (default: 8)")

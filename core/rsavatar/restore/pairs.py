@@ -84,7 +84,7 @@ def shrunk(take: Take, factor: int) -> Take:
 
     def smaller(stack: Bytes) -> Bytes:
         split = stack.reshape(len(stack), height // factor, factor, width // factor, factor, 3)
-        return (split.mean((2, 4)) + 0.5).astype(np.uint8)
+        return np.asarray(split.mean((2, 4)) + 0.5, np.uint8)
 
     first = None if take.first is None else smaller(take.first)
     return Take(smaller(take.rolling), smaller(take.middle), first)

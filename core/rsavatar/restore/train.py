@@ -44,6 +44,7 @@ class Recipe:
     columns: int = 192
     shrink: int = 1  # times smaller than the pairs are: fast first steps
     rate: float = 1e-4
+    instants: int = 3  # of CVR's in a step: all that the data know, or a draw of fewer
     warmup: float = 0.25  # CVR from nothing: part of the training that teaches its flow alone
     seed: int = 0
     held_out: int = 8  # takes at the end that are validated on
@@ -53,10 +54,10 @@ class Recipe:
     def __post_init__(self) -> None:
         if self.model not in NAMES:
             raise DataError(expected("model", f"one of {', '.join(NAMES)}", repr(self.model)))
-        if self.columns % 64 or not 0 < self.width <= 1 or min(self.steps, self.batch, self.every, self.shrink) < 1:
-            got = (self.columns, self.width, self.steps, self.batch, self.every, self.shrink)
-            wanted = "columns a multiple of 64, width in (0, 1], steps, batch, every, shrink of at least 1"
-            raise DataError(expected("recipe", wanted, got))
+        counts = (self.steps, self.batch, self.every, self.shrink, self.instants)
+        if self.columns % 64 or not 0 < self.width <= 1 or min(counts) < 1:
+            wanted = "columns a multiple of 64, width in (0, 1], steps, batch, every, shrink and instants of at least 1"
+            raise DataError(expected("recipe", wanted, (self.columns, self.width, *counts)))
         if not (self.rate > 0 and self.minutes > 0 and 0 <= self.warmup < 1 and self.held_out >= 0):
             got = (self.rate, self.minutes, self.warmup, self.held_out)
             raise DataError(expected("recipe", "rate and minutes above 0, warmup in [0, 1), held_out not below 0", got))
@@ -154,7 +155,10 @@ class Trainer:
         if self.start.init is None and share < self.recipe.warmup:
             return flow_loss(network, frames)
         flows = network.motion(frames)
-        made = {time: network.at(frames, flows, time) for time in batch.truths}
+        rng = np.random.default_rng([self.recipe.seed, self.step, 1])
+        count = min(self.recipe.instants, len(batch.truths))
+        chosen = sorted(float(time) for time in rng.choice(sorted(batch.truths), count, replace=False))
+        made = {time: network.at(frames, flows, time) for time in chosen}
         return cvr_loss(made, batch.truths, self.perception)
 
     def _look(self, loss: float, report: Report) -> None:

@@ -114,6 +114,15 @@ def load(model: Name, files: tuple[Path, ...]) -> tuple[nn.Module, Origin]:
     return network.eval().requires_grad_(False), Origin(_label(files, header), digest.hexdigest())
 
 
+def which(model: Name) -> str:
+    """In words, the weights that ``model`` would be used with; or why it cannot be used."""
+    try:
+        files = find(model)
+        return _label(files, read_header(files[0]))
+    except DataError as error:
+        return f"none ({error})"
+
+
 def load_state(network: nn.Module, state: Mapping[str, Tensor], what: str) -> None:
     """Put ``state`` into ``network``; every name and shape must fit.
 
