@@ -155,8 +155,8 @@ def recovered_motion(actor: Actor, subject: Subject) -> dict[str, Array]:
     found: dict[str, list[Array]] = {"poses": [], "Rh": [], "Th": []}
     for frame in range(subject.frames):
         state = actor.motion.state(frame, offsets)
-        rotations, residuals = state.rotations.double(), actor.residuals(state.rotations)
-        poses = rotations if residuals is None else compose(rotations, residuals.double())
+        rotations, residuals = actor.deformed(state.rotations)
+        poses = rotations.double() if residuals is None else compose(rotations.double(), residuals.double())
         for name, value in (("poses", poses.flatten(1)), ("Rh", state.Rh), ("Th", state.Th)):
             found[name].append(value.double().numpy())
     stacked = {name: np.stack(values) for name, values in found.items()}

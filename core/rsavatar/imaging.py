@@ -110,17 +110,21 @@ class Actor(torch.nn.Module):
         self.skin_offset = skin_offset
         self.clock = clock
 
-    def residuals(self, rotations: Tensor) -> Tensor | None:
-        """Residual axis-angle [D, 24, 3] of poses [D, 24, 3] (paper, eq. disp, composed on SO(3)); None without it."""
+    def deformed(self, rotations: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Poses [D, 24, 3] and what is composed with them on SO(3), if anything (paper, eq. disp).
+
+        The residual is composed on SO(3); where the network says ``additive``, it is the paper's: added, axis-angle.
+        """
         if self.pose_residual is None:
-            return None
-        return torch.nn.functional.pad(self.pose_residual(rotations[:, 1:]), (0, 0, 1, 0))
+            return rotations, None
+        residual = torch.nn.functional.pad(self.pose_residual(rotations[:, 1:]), (0, 0, 1, 0))
+        return (rotations + residual, None) if self.pose_residual.additive else (rotations, residual)
 
     def transforms(self, frame: int, offsets: Tensor) -> Tensor:
         """Canonical-to-world joint transforms [D, 24, 3, 4] of ``frame`` at ``offsets`` source frames from its mid."""
         state = self.motion.state(frame, offsets)
         rest = self.joints + self.joint_directions @ self.shapes
-        return pose(state.rotations, self.residuals(state.rotations), state.Rh, state.Th, rest, self.parents)
+        return pose(*self.deformed(state.rotations), state.Rh, state.Th, rest, self.parents)
 
     def skin_weights(self) -> Tensor:
         """Skinning weights [24, M]; differentiable in the offset network where there is one."""

@@ -115,6 +115,9 @@ class JobSpec(BaseModel):
     )
     continuity: Literal["aligned", "paper"] = Field("aligned", description="instants that L_reg compares")
     perturbation: Literal["zero-mean", "positive"] = Field("zero-mean", description="noise on initial control points")
+    residual: Literal["composed", "additive"] = Field(
+        "composed", description="the pose network's output: composed on SO(3), or added as in the paper's formula"
+    )
     regime: Literal["pose-first", "authors"] = Field(
         "pose-first", description="step sizes: the motion fast and the Gaussians slow and small, or the authors' own"
     )

@@ -9,6 +9,7 @@ import torch
 from rsavatar import catalog
 from rsavatar.data.base import TrueMotion
 from rsavatar.errors import DataError, SpecError
+from rsavatar.geometry.rotations import exp_so3
 from rsavatar.imaging import Actor
 from rsavatar.methods.base import AbstractMethod, Case, build_actor, check_case, observations, settings
 from rsavatar.motion.base import AbstractMotion
@@ -82,6 +83,23 @@ class TestAblations:
 
     def test_calibration_adds_a_clock_and_nothing_else(self) -> None:
         assert parts(small_subject.case(calibrate=["readout"])) - parts(small_subject.case()) == {"clock"}
+
+    def test_the_residual_is_composed_or_added(self) -> None:
+        """About one axis the two are the same rotation; about two they are not."""
+        built = [build(small_subject.case(residual=kind)) for kind in ("composed", "additive")]
+        for actor in built:
+            assert actor.pose_residual is not None
+            with torch.no_grad():  # whatever the pose, 0.3 about x
+                last = list(actor.pose_residual.parameters())[-2:]
+                last[0].zero_()
+                last[1].copy_(torch.tensor([0.3, 0.0, 0.0]).repeat(23))
+        for axis, same in (((0.5, 0.0, 0.0), True), ((0.0, 0.5, 0.0), False)):
+            pose = torch.zeros(1, 24, 3)
+            pose[:, 1:] = torch.tensor(axis)
+            turned = [
+                exp_so3(r) if d is None else exp_so3(r) @ exp_so3(d) for r, d in (a.deformed(pose) for a in built)
+            ]
+            assert torch.allclose(turned[0], turned[1], atol=1e-6) == same
 
     def test_no_rs_takes_the_readout_for_zero(self) -> None:
         case = small_subject.case(ablation={"no_rs": True})

@@ -12,11 +12,13 @@ OCTAVES = 10
 class PoseResidual(torch.nn.Module):
     """Axis-angle residual [D, 23, 3] predicted from the interpolated pose [D, 23, 3] (paper, eq. disp).
 
-    Starts at (almost) zero: the last layer is uniform in +-1e-5.
+    Starts at (almost) zero: the last layer is uniform in +-1e-5. ``additive`` says how it is meant: added to the
+    pose's axis-angle vectors as the paper writes it, or composed with the rotations.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, additive: bool = False) -> None:
         super().__init__()
+        self.additive = additive
         self.layers = torch.nn.Sequential(
             torch.nn.Linear(69, WIDTH),
             torch.nn.ReLU(),

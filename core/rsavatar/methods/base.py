@@ -121,13 +121,14 @@ def build_actor(method: AbstractMethod, case: Case) -> Actor:
     torch.manual_seed(case.spec.seed)  # the networks' initial weights
     fit, lost = method.initial_fit(case), case.spec.ablation
     unknown, timing = case.spec.calibrate, case.subject.timing
+    additive = case.spec.residual == "additive"
     surface = Surface(case.body, fit.shapes)
     motion = method.motion(case)
     return Actor(
         Avatar(surface),
         motion,
         surface.pose_offsets(fit.poses),
-        None if lost.no_pose_deformation or not list(motion.parameters()) else PoseResidual(),
+        None if lost.no_pose_deformation or not list(motion.parameters()) else PoseResidual(additive),
         None if lost.no_lbs_refinement else SkinOffset(),
         ReadoutClock(len(case.subject.training), timing.period_frames, unknown) if unknown else None,
     )
