@@ -161,13 +161,13 @@ def read_settings() -> Settings:
         raise SettingsError(name, first["msg"].lower(), repr(first["input"])) from None
 
 
-def from_files() -> dict[str, str]:
+def from_files() -> dict[str, Any]:
     """Settings whose value is a file's first line: ``RSAVATAR_X_FILE`` gives ``x``. Secrets are in no environment then.
 
     Raises:
         SettingsError: if the file cannot be read, or ``RSAVATAR_X`` is given as well.
     """
-    found = {}
+    found: dict[str, Any] = {}
     for name in Settings.model_fields:
         variable = f"RSAVATAR_{name.upper()}"
         path = os.environ.get(f"{variable}_FILE")

@@ -17,8 +17,8 @@ from services.api.grid_views import GridDetail, GridPage, GridPlan, GridView, de
 from services.api.requests import checked_key
 from services.errors import NotFoundError, RequestError
 from services.store import content, estimates, grids, steering, subjects
-from services.store.records import Subject
 from services.store.session import Store
+from services.store.subject_records import Subject
 
 LONGEST_KEY = 200  # the jobs' own keys are longer
 GridId = Annotated[str, Path(pattern=UUID, description="id of a grid")]

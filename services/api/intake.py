@@ -14,8 +14,9 @@ from services.api.batches import Batches
 from services.errors import NotFoundError, RequestError
 from services.store import content, intake, subjects
 from services.store.intake import Accepted
-from services.store.records import State, Subject, Submission
+from services.store.records import State, Submission
 from services.store.session import Store
+from services.store.subject_records import Subject
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from services.api.deps import Back
 from services.api.layout import PageRoute, page
 from services.errors import NotFoundError
 from services.store import listing, pictures, subjects
-from services.store.records import Subject
 from services.store.session import Store
+from services.store.subject_records import Subject
 
 LARGEST_META = 1 << 20
 PICTURES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}

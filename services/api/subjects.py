@@ -20,8 +20,8 @@ from services.api.views import SubjectView
 from services.errors import ConflictError, RequestError
 from services.settings import LOOPBACK, Settings
 from services.store import subjects
-from services.store.records import Subject
 from services.store.session import Store
+from services.store.subject_records import Subject
 
 ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {"model": SubjectView, "description": "known already"},

@@ -25,8 +25,8 @@ from services.errors import ConflictError, NotFoundError, RequestError
 from services.settings import ROOT, Settings
 from services.store import subjects
 from services.store.ids import new_id
-from services.store.records import Subject, SubjectState
 from services.store.session import Store
+from services.store.subject_records import Subject, SubjectState
 from services.unpack.caps import Order
 
 WRITE_BYTES = 1 << 20

@@ -8,7 +8,8 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from services.store.records import TERMINAL, Artifact, Job, Outcome, State, Subject, fraction_of
+from services.store.records import TERMINAL, Artifact, Job, Outcome, State, fraction_of
+from services.store.subject_records import Subject
 
 PLAIN: tuple[str, ...] = ("id", "state", "method", "subject", "priority", "grid_id", "owner", "reused_from")
 PLAIN += ("attempt", "failures", "max_attempts", "rss_bytes")

@@ -17,8 +17,8 @@ from pathlib import Path
 import rsavatar
 from rsavatar.spec import JobSpec
 from services.errors import RequestError
-from services.store.records import Subject
 from services.store.session import Store
+from services.store.subject_records import Subject
 from services.store.tables import SubjectRow
 
 FRESH_SECONDS = 5.0

@@ -11,8 +11,9 @@ from sqlalchemy.orm import Session
 
 from rsavatar.catalog import STUDIO_NAME
 from services.errors import ConflictError, NotFoundError
-from services.store.records import TERMINAL, Subject, SubjectState
+from services.store.records import TERMINAL
 from services.store.session import Store, db_now
+from services.store.subject_records import Subject, SubjectState
 from services.store.tables import JobRow, SubjectRow
 
 STUDIO = Subject("studio", None, "built-in", {"description": "synthetic subject with true motion, made on first use"})

@@ -25,8 +25,8 @@ from services.process import identity, is_surely_dead, signal_group
 from services.settings import ROOT, Settings
 from services.store import subjects
 from services.store.ids import new_id
-from services.store.records import Subject, SubjectState
 from services.store.session import Store
+from services.store.subject_records import Subject, SubjectState
 from services.worker.launch import child_environment
 
 EXAMINER = """

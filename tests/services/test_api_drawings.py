@@ -21,8 +21,9 @@ from services.api.renderer import RenderProcess
 from services.errors import RenderError
 from services.settings import Settings, make_home
 from services.store import artifacts, jobs, leases, schema, subjects
-from services.store.records import Outcome, Point, Score, Subject, Submission
+from services.store.records import Outcome, Point, Score, Submission
 from services.store.session import Store
+from services.store.subject_records import Subject
 from tests.core.finished_run import run_figure
 from tests.services.conftest import serving, submit
 

@@ -16,8 +16,9 @@ from services import backup
 from services.errors import BackupError
 from services.settings import ROOT, Settings, make_home
 from services.store import artifacts, audit, jobs, subjects
-from services.store.records import Filters, Subject
+from services.store.records import Filters
 from services.store.session import Store
+from services.store.subject_records import Subject
 from tests.services.conftest import POSTGRESQL, submit
 from tests.services.test_audit import entry
 

@@ -16,8 +16,9 @@ from rsavatar.spec import resolve
 from services.errors import RequestError, SettingsError
 from services.settings import Settings
 from services.store import artifacts, blobs, content, garbage, jobs, leases, stages, subjects
-from services.store.records import Batch, Checkpoint, Outcome, Subject
+from services.store.records import Batch, Checkpoint, Outcome
 from services.store.session import Store
+from services.store.subject_records import Subject
 from tests.services.conftest import submit
 
 OLD = -1.0  # a grace that everything is older than
