@@ -62,7 +62,7 @@ def read_pack(path: Path) -> list[Take]:
         DataError: if the file is missing, damaged or something else.
     """
     try:
-        with np.load(path, allow_pickle=False) as held:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as held:
             images, ends, kinds = (np.asarray(held[name]) for name in ("images", "ends", "sequences"))
         files = iter(np.split(images, ends[:-1]))
         return [_take(files, int(frames), bool(first)) for frames, first in kinds]
