@@ -113,6 +113,7 @@ class JobSpec(BaseModel):
     motion: Literal["sequence-spline", "frame-spline"] = Field(
         "sequence-spline", description="one spline over the sequence, or P control points a frame tied by L_reg"
     )
+    knots: int = Field(1, ge=1, le=8, description="knots per frame of the one spline over the sequence")
     continuity: Literal["aligned", "paper"] = Field("aligned", description="instants that L_reg compares")
     perturbation: Literal["zero-mean", "positive"] = Field("zero-mean", description="noise on initial control points")
     residual: Literal["composed", "additive"] = Field(
@@ -146,6 +147,8 @@ class JobSpec(BaseModel):
             raise ValueError(expected("ablation", f"components that {self.method} has ({has})", ", ".join(alien)))
         if self.ablation.no_reg and self.motion == "sequence-spline":
             raise ValueError(expected("ablation.no_reg", "motion frame-spline, which has a penalty", repr(self.motion)))
+        if self.knots != 1 and self.motion != "sequence-spline":
+            raise ValueError(expected("knots", "1, or motion sequence-spline", self.knots))
         if self.T == "scanline" and self.method == "mad-avatar":
             raise ValueError(expected("T", "a finite number of renders for mad-avatar to average", "'scanline'"))
         self._check_schedule()

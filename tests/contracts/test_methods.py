@@ -110,6 +110,11 @@ class TestAblations:
         shape = next(build(small_subject.case(ablation={"no_spline": True})).motion.parameters()).shape
         assert shape == (small_subject.FRAMES, 25, 3)
 
+    def test_knots_are_per_frame(self) -> None:
+        """An interval a period, from a period before the first mid time to one after the last: 4, and 3 more points."""
+        counts = [len(next(build(small_subject.case(knots=k)).motion.parameters())) for k in (1, 2)]
+        assert counts == [4 + 3, 8 + 3]
+
     def test_no_reg_takes_the_penalty_away(self) -> None:
         assert settings(small_subject.case(ablation={"no_reg": True})).lambda_reg == 0
         assert settings(small_subject.case()).lambda_reg == 1

@@ -81,6 +81,7 @@ def test_a_presets_scanline_is_not_laid_under_methods_that_select_no_rows() -> N
             {"method": "gauhuman", "ablation": {"no_rs": True}},
             "ablation: expected components that gauhuman has.*got no_rs",
         ),
+        ({"motion": "frame-spline", "knots": 2}, "knots: expected 1, or motion sequence-spline, got 2"),
         ({"method": "mad-avatar", "T": "scanline"}, "T: expected a finite number .*got 'scanline'"),
     ],
 )
@@ -105,7 +106,7 @@ def test_the_hash_ignores_how_a_job_runs_and_nothing_else() -> None:
         "regime": "authors", "continuity": "paper", "perturbation": "positive", "sh_degree": 0,
         "mask_weight": 0.25, "densify": False, "checkpoint_every": 7, "ablation": {"no_rs": True},
         "calibrate": ["readout"], "exposure_samples": 2, "doubt": False, "disturb": {"masks": 0.1},
-        "exposure_frames": 0.0, "ssim_weight": 0.2, "residual": "additive", "skip": ["body"],
+        "exposure_frames": 0.0, "ssim_weight": 0.2, "residual": "additive", "knots": 2, "skip": ["body"],
     }  # fmt: skip
     names = {field.alias or name for name, field in JobSpec.model_fields.items()}
     assert set(changes) == names - NOT_OF_RESULT  # a new word must be given a change here

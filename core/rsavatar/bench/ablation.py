@@ -27,6 +27,8 @@ _OWN_ROWS = (
     ("ours, no_lbs_refinement", {"ablation": {"no_lbs_refinement": True}}),
     ("ours, T=K", {"T": "K"}),
     ("ours, a spline per frame + L_reg", {"motion": "frame-spline"}),
+    ("ours, two knots a frame", {"knots": 2}),
+    ("ours, residual added as in the paper", {"residual": "additive"}),
     ("ours, the authors' step sizes", {"regime": "authors"}),
 )
 _AMOUNTS = (

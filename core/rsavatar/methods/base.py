@@ -65,7 +65,7 @@ def sub_frame_motion(case: Case) -> AbstractMotion:
     if spec.ablation.no_spline:
         return StillPose(initial)
     if spec.motion == "sequence-spline":
-        return SequenceSpline(initial)
+        return SequenceSpline(initial, spec.knots)
     return FrameSpline(initial, case.bands, spec.P, spec.perturbation, spec.seed)
 
 
