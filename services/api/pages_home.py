@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,12 +15,13 @@ from rsavatar.spec import Preset
 from services.api import findings
 from services.api.deps import Back, Backend
 from services.api.layout import PageRoute, page
-from services.api.tables import rows_of
+from services.api.tables import to_row
 from services.api.views import JobView
 from services.store import events, jobs, listing, metrics, pictures
 from services.store.records import State, TableEntry
 
 NEWEST = 8
+LOOKED_AT = 1000  # newest results that the overview is made of; downloads are of all
 PAPER = "paper: "  # begins the titles of columns that are the paper's
 
 router = APIRouter(route_class=PageRoute)
@@ -70,7 +72,8 @@ class Disk:
 def index(request: Request, back: Back, preset: Preset | None = None) -> HTMLResponse:
     """The overview of one preset's results: methods can only be compared at one budget."""
     newest = events.newest_id(back.store)  # before everything else, so that the stream misses nothing
-    entries = metrics.table_entries(back.store)
+    counts = jobs.count_by_state(back.store)
+    entries = listing.newest_of_specs(back.store, LOOKED_AT)
     presets = findings.presets_of(entries)
     chosen = preset or (presets[0] if presets else "draft")
     found = findings.finding(entries, chosen)
@@ -80,16 +83,16 @@ def index(request: Request, back: Back, preset: Preset | None = None) -> HTMLRes
         "presets": presets,
         "finding": found,
         "pair": _pair(back, found),
-        "table": to_grid(render("main", rows_of(back.store, chosen), "md")),
+        "table": to_grid(render("main", [to_row(e) for e in entries if e.job.spec.get("preset") == chosen], "md")),
+        "looked_at": LOOKED_AT if counts[State.SUCCEEDED] > LOOKED_AT else None,
         "results": listing.newest_results(back.store, NEWEST),
-        **_state(back),
+        **_state(back, counts),
     }
     return page(request, "home.html", context)
 
 
-def _state(back: Backend) -> dict[str, Any]:
+def _state(back: Backend, counts: Mapping[str, int]) -> dict[str, Any]:
     usage = shutil.disk_usage(back.settings.home)
-    counts = jobs.count_by_state(back.store)
     return {
         "counts": counts,
         "running": [JobView.of(job) for job in listing.running(back.store)],

@@ -17,6 +17,7 @@ from services.api.pages_home import common_view
 from services.api.views import JobView
 from services.errors import RequestError
 from services.store import events, jobs, listing, subjects
+from services.store.query import LONGEST
 from services.store.records import Filters, Job, State, TableEntry
 
 SHOWN = 50
@@ -46,13 +47,14 @@ class ListQuery(BaseModel):
     method: str | None = Field(None, max_length=64)
     subject: str | None = Field(None, max_length=128)
     grid: str | None = Field(None, pattern=UUID)
+    q: str | None = Field(None, max_length=LONGEST)
     sort: SortKey = "submitted"
     order: Literal["asc", "desc"] = "desc"
     after: str | None = Field(None, pattern=UUID)
 
     def filters(self) -> Filters:
         """The filters; an empty choice is none."""
-        return Filters(self.state or None, self.method or None, self.subject or None, self.grid or None)
+        return Filters(self.state or None, self.method or None, self.subject or None, self.grid or None, self.q or None)
 
     def address(self, **changes: object) -> str:
         """The list's address with some of it changed; what has its default is left out."""

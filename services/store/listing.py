@@ -17,7 +17,7 @@ from services.store.filters import where
 from services.store.jobs import to_job
 from services.store.records import Filters, Job, State, TableEntry
 from services.store.session import Store, db_now
-from services.store.tables import ArtifactRow, JobRow, ResultRow
+from services.store.tables import ArtifactRow, BlobRow, JobRow, ResultRow
 
 LOWEST = -1e300  # where a row without a value stands
 SORTS: dict[str, ColumnElement[Any]] = {
@@ -117,6 +117,14 @@ def newest_results(store: Store, limit: int, filters: Filters | None = None) -> 
         return [_entry(job, result) for job, result in session.execute(query)]
 
 
+def newest_of_specs(store: Store, limit: int) -> list[TableEntry]:
+    """Of the ``limit`` newest results, the newest of every spec: what an overview can afford however many there are."""
+    found: dict[str, TableEntry] = {}
+    for entry in newest_results(store, limit):
+        found.setdefault(entry.job.spec_sha256, entry)
+    return list(found.values())
+
+
 def results_of(store: Store, job_ids: Sequence[str]) -> dict[str, TableEntry]:
     """Results of the jobs among ``job_ids`` that have one."""
     query = select(JobRow, ResultRow).join(ResultRow, ResultRow.job_id == JobRow.id).where(JobRow.id.in_(job_ids))
@@ -152,9 +160,8 @@ def _distinct(session: Session, column: ColumnElement[str]) -> list[str]:
 
 def stored_bytes(store: Store) -> int:
     """Bytes of all artifacts, each counted once however many jobs have it."""
-    once = select(func.max(ArtifactRow.size).label("size")).group_by(ArtifactRow.sha256).subquery()
     with store.read() as session:
-        return int(session.scalar(select(func.sum(once.c.size))) or 0)
+        return int(session.scalar(select(func.sum(BlobRow.size))) or 0)
 
 
 def with_pictures(store: Store, subjects: Sequence[str]) -> dict[str, str]:
