@@ -30,7 +30,7 @@ from rsavatar.errors import DataError, expected
 from rsavatar.evaluate import render_slots, render_view, world_joints
 from rsavatar.geometry.cameras import Camera
 from rsavatar.imaging import Actor
-from rsavatar.methods.base import AbstractMethod, Case
+from rsavatar.methods.base import AbstractMethod, Case, as_read, is_sideways, slots_as_read
 from rsavatar.shutter.base import Slot
 from rsavatar.train import Observation
 
@@ -60,9 +60,7 @@ class Shown:
 
     def slots(self, camera: str) -> tuple[Slot, ...]:
         """How the method believes that ``camera`` exposes its rows."""
-        subject = self.subject
-        clock = (subject.timing.readout_frames, subject.timing.trigger(camera))
-        return self.method.shutter(self.case).slots(subject.cameras[camera].height, *clock)
+        return slots_as_read(self.method, self.case, camera, self.subject.timing.readout_frames)
 
 
 def write_pictures(shown: Shown, out: Path) -> dict[str, Path]:
@@ -90,8 +88,8 @@ def _rendered(shown: Shown, predictions: Path) -> Iterable[tuple[str, bytes]]:
             place = f"{camera}/{frame:06d}"
             yield f"{place}/result.png", _png(render_view(actor, subject, camera, frame, weights, degree))
             if len(slots) > 1 or slots[0].rate:  # else it is the same picture
-                view = subject.cameras[camera]
-                yield f"{place}/exposed.png", _png(render_slots(actor, view, frame, slots, weights, degree))
+                shot = render_slots(actor, as_read(shown.case, camera), frame, slots, weights, degree)
+                yield f"{place}/exposed.png", _png(np.rot90(shot) if is_sideways(shown.case) else shot)
 
 
 def references_of(subject: Subject) -> Path:
@@ -171,12 +169,13 @@ def _camera(camera: Camera, shown: Shown, name: str) -> dict[str, Any]:
     intrinsics = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
     matrix = intrinsics @ np.c_[camera.rotation / MILLIMETRES, camera.translation]
     training = name in shown.subject.training
+    drawn = training and not is_sideways(shown.case)  # seams are drawn as rows
     return {
         "matrix": [[float(f"{value:.8g}") for value in row] for row in matrix],
         "size": [camera.width, camera.height],
         "trigger_frames": shown.subject.timing.trigger(name),
         "training": training,
-        "slots": [[s.lo, s.hi, s.start, s.rate, s.weight] for s in shown.slots(name)] if training else [],
+        "slots": [[s.lo, s.hi, s.start, s.rate, s.weight] for s in shown.slots(name)] if drawn else [],
     }
 
 

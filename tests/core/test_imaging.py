@@ -11,9 +11,10 @@ from rsavatar.methods.base import build_actor
 from rsavatar.methods.rolling import RollingShutterAvatar
 from rsavatar.shutter.base import AbstractShutter
 from rsavatar.shutter.rolling import Bands, Blur, Instant, Scanline
+from tests.contracts.test_shutters import Upwards
 from tests.core import small_subject
 
-SHUTTERS: list[AbstractShutter] = [Instant(), Blur(3), Bands(7), Scanline(), Scanline(0.2, 3), Scanline(direction="up")]
+SHUTTERS: list[AbstractShutter] = [Instant(), Blur(3), Bands(7), Scanline(), Scanline(0.2, 3), Upwards(Scanline())]
 
 
 def instants(schedule: Schedule, row: int) -> list[float]:

@@ -14,8 +14,10 @@ from rsavatar.imaging import NODES, expose, plan, polynomials
 from rsavatar.methods.base import observations, settings
 from rsavatar.methods.rolling import RollingShutterAvatar
 from rsavatar.render.base import Scene
+from rsavatar.shutter.base import AbstractShutter
 from rsavatar.shutter.rolling import Bands, Scanline
 from rsavatar.skipping import LOOK_EVERY, Nodes, Settled, Work, needed_nodes, thinned
+from tests.contracts.test_shutters import Upwards
 from tests.core import small_subject
 
 
@@ -30,8 +32,8 @@ def moving(motion_px: float, nodes: int = NODES) -> Scene:
 
 
 @pytest.mark.parametrize("nodes", [1, 2, 3, 4])
-@pytest.mark.parametrize("shutter", [Scanline(), Scanline(0.3, 3), Scanline(direction="up")])
-def test_a_thinned_schedule_is_what_would_have_been_planned(nodes: int, shutter: Scanline) -> None:
+@pytest.mark.parametrize("shutter", [Scanline(), Scanline(0.3, 3), Upwards(Scanline())])
+def test_a_thinned_schedule_is_what_would_have_been_planned(nodes: int, shutter: AbstractShutter) -> None:
     slots = shutter.slots(40, 11.0, 1.5)
     found, wanted = thinned(plan(slots, 3, 31), nodes), plan(slots, 3, 31, nodes)
     assert found.coefficients == nodes

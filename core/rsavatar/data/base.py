@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -41,6 +42,9 @@ class BodyFit:
                 raise DataError(expected(f"body fit {name}", "finite numbers", "NaN or infinity"))
 
 
+Direction = Literal["down", "up", "right", "left"]
+
+
 @dataclass(frozen=True)
 class Timing:
     """When rows are exposed, in source frames. Row v of H of frame n in camera c is exposed at
@@ -53,6 +57,7 @@ class Timing:
     trigger_frames: Mapping[str, float] = field(default_factory=dict)  # delta_c by camera name; absent = 0
     exposure_frames: float = 0.0  # of every row, centred on the row's time
     fps: float | None = None  # source frames a second, where they are known
+    direction: Direction = "down"  # in which the sensor is read; of a sideways one v and H count columns
 
     def trigger(self, camera: str) -> float:
         """delta_c in source frames."""

@@ -16,12 +16,12 @@ import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from rsavatar.data.annots import Calibration, fit_folder, numbers, read_calibrations, read_fits
-from rsavatar.data.base import Array, BodyFit, Image, ReadImage, Subject, Timing, TrueMotion
+from rsavatar.data.base import Array, BodyFit, Direction, Image, ReadImage, Subject, Timing, TrueMotion
 from rsavatar.data.images import Frame, Frames, fingerprint, locate, read_frame, size_of
 from rsavatar.errors import DataError, expected
 
@@ -39,6 +39,7 @@ class Meta:
     pixel_centre: float  # where the first pixel's centre lies
     exposure: float  # source frames
     fps: float | None  # source frames a second
+    direction: Direction  # in which the sensors are read
     missing: frozenset[tuple[str, int]]  # training images, by camera name and frame, that there are none of
 
 
@@ -144,6 +145,7 @@ def _parse_meta(path: Path, values: dict[str, Any]) -> Meta:
         pixel_centre=float(values.get("pixel_centre", 0.0)),
         exposure=float(values.get("exposure", 0.0)),
         fps=None if values.get("fps") is None else float(values["fps"]),
+        direction=values.get("direction", "down"),
         missing=frozenset((name_of(int(c)), int(n)) for c, n in values.get("missing", [])),
     )
 
@@ -160,6 +162,8 @@ def _check_meta(path: Path, meta: Meta, frames: int) -> None:
     unknown = sorted(f for f in meta.missing if f[0] not in map(name_of, meta.train) or not 0 <= f[1] < frames)
     if unknown:
         raise DataError(expected(f"{path} missing", "pairs of a training camera and a frame", unknown))
+    if meta.direction not in get_args(Direction):
+        raise DataError(expected(f"{path} direction", f"one of {', '.join(get_args(Direction))}", meta.direction))
     if meta.pixel_centre not in (0.0, 0.5):
         raise DataError(expected(f"{path} pixel_centre", "0 or 0.5", meta.pixel_centre))
     if meta.delta and len(meta.delta) <= max(meta.train + meta.test):
@@ -201,7 +205,7 @@ def _reader(what: str, frames: Frames, calibrations: list[Calibration], pixel_ce
 
 def _timing(meta: Meta, listed: Iterable[int]) -> Timing:
     triggers = {name_of(camera): meta.delta[camera] for camera in listed} if meta.delta else {}
-    return Timing(meta.mid, meta.gamma * meta.period, meta.period, triggers, meta.exposure, meta.fps)
+    return Timing(meta.mid, meta.gamma * meta.period, meta.period, triggers, meta.exposure, meta.fps, meta.direction)
 
 
 def _fingerprint(root: Path, folder: Path, frames: list[Frame]) -> str:

@@ -57,6 +57,23 @@ class Camera:
         """The same camera seeing only columns [x0, x1) and rows [y0, y1)."""
         return replace(self, cx=self.cx - x0, cy=self.cy - y0, width=x1 - x0, height=y1 - y0)
 
+    def turned(self) -> Camera:
+        """The same camera held a quarter turn aside: its picture is this one's, turned clockwise (``np.rot90(p, -1)``).
+
+        Columns, from the left, become rows, from the top.
+        """
+        quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        return Camera(
+            quarter @ self.rotation,
+            quarter @ self.translation,
+            fx=self.fy,
+            fy=self.fx,
+            cx=self.height - self.cy,
+            cy=self.cx,
+            height=self.width,
+            width=self.height,
+        )
+
     def scaled(self, factor: float) -> Camera:
         """The same camera with pixels ``1 / factor`` times as large."""
         return replace(

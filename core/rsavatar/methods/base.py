@@ -17,13 +17,14 @@ from rsavatar.body.base import BodyModel
 from rsavatar.data.base import BodyFit, Bytes, Subject
 from rsavatar.errors import DataError, SpecError, expected
 from rsavatar.events import Report
+from rsavatar.geometry.cameras import Camera
 from rsavatar.imaging import Actor, Schedule, plan
 from rsavatar.motion.base import AbstractMotion, InitialMotion
 from rsavatar.motion.sequence import SequenceSpline
 from rsavatar.motion.spline import FrameSpline
 from rsavatar.motion.still import StillPose
 from rsavatar.optimization import POSE_FIRST, Rates, Settings
-from rsavatar.shutter.base import AbstractShutter
+from rsavatar.shutter.base import AbstractShutter, Slot, upwards
 from rsavatar.shutter.clock import ReadoutClock
 from rsavatar.spec import JobSpec
 from rsavatar.train import Observation
@@ -151,8 +152,8 @@ def observations(method: AbstractMethod, case: Case) -> list[Observation]:
 
 def _observe(method: AbstractMethod, case: Case, name: str, frame: int) -> Observation | None:
     """One training image; None where nobody is in it, so that there is nothing to learn from it."""
-    subject, camera = case.subject, case.subject.cameras[name]
-    rgb, mask = subject.observe(name, frame)
+    subject, camera = case.subject, as_read(case, name)
+    rgb, mask = (turn_as_read(case, picture) for picture in subject.observe(name, frame))
     box = body_box(mask)
     if box is None:
         return None
@@ -163,13 +164,34 @@ def _observe(method: AbstractMethod, case: Case, name: str, frame: int) -> Obser
     return Observation(frame, cut, schedule, pixels, coverage, (camera.height, camera.width), f"{name}/{frame:06d}")
 
 
+def is_sideways(case: Case) -> bool:
+    """Whether the subject's sensors are read column by column: their pictures are taken turned, so that rows scan."""
+    return case.subject.timing.direction in ("right", "left")
+
+
+def as_read(case: Case, name: str) -> Camera:
+    """Camera ``name``, held so that what is exposed together is a row."""
+    camera = case.subject.cameras[name]
+    return camera.turned() if is_sideways(case) else camera
+
+
+def turn_as_read(case: Case, picture: Bytes) -> Bytes:
+    """A picture of such a camera, from the subject's."""
+    return np.rot90(picture, -1) if is_sideways(case) else picture
+
+
+def slots_as_read(method: AbstractMethod, case: Case, name: str, readout: float) -> tuple[Slot, ...]:
+    """How the method believes that the rows of ``as_read``'s camera are exposed, in ``readout`` source frames."""
+    height, timing = as_read(case, name).height, case.subject.timing
+    slots = method.shutter(case).slots(height, readout, timing.trigger(name))
+    return upwards(slots, height) if timing.direction in ("up", "left") else slots
+
+
 def _schedule(method: AbstractMethod, case: Case, name: str, rows: tuple[int, int]) -> Schedule:
     """When the ``rows`` [top, bottom) of camera ``name`` are exposed, as the method believes."""
-    height, timing, shutter = case.subject.cameras[name].height, case.subject.timing, method.shutter(case)
-    once, twice = (
-        plan(shutter.slots(height, readout, timing.trigger(name)), *rows)
-        for readout in (timing.readout_frames, 2 * timing.readout_frames)
-    )  # instants are affine in the readout: the difference is the part that is proportional to it
+    readout = case.subject.timing.readout_frames
+    once, twice = (plan(slots_as_read(method, case, name, length), *rows) for length in (readout, 2 * readout))
+    # instants are affine in the readout: the difference is the part that is proportional to it
     return replace(once, camera=case.subject.training.index(name), reading=twice.offsets - once.offsets)
 
 

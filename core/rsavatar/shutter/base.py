@@ -7,6 +7,7 @@ in source frames relative to the frame's mid time. A slot contributes ``weight``
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rsavatar.errors import SpecError, expected
@@ -36,6 +37,12 @@ class Slot:
     def span(self) -> tuple[float, float]:
         """First and last instant of the slot's rows, in row order."""
         return self.start + self.rate * self.lo, self.start + self.rate * (self.hi - 1)
+
+
+def upwards(slots: Sequence[Slot], height: int) -> tuple[Slot, ...]:
+    """The same slots of a sensor that is read from its last row to its first."""
+    turned = [Slot(height - s.hi, height - s.lo, s.start + s.rate * (height - 1), -s.rate, s.weight) for s in slots]
+    return tuple(sorted(turned, key=lambda s: (s.lo, s.start)))
 
 
 class AbstractShutter(ABC):

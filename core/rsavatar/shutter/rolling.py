@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 from rsavatar.errors import SpecError, expected
 from rsavatar.shutter.base import AbstractShutter, Slot
@@ -51,21 +50,17 @@ class Scanline(AbstractShutter):
     """The continuous rolling shutter: row v at its own instant (paper, eqs. rowtime and rs).
 
     ``exposure`` (a fraction of the readout) adds blur: each row is the mean of ``samples`` scans shifted over the
-    exposure. ``direction`` "up" reads from the last row to the first.
+    exposure.
     """
 
     exposure: float = 0.0
     samples: int = 1
-    direction: Literal["down", "up"] = "down"
 
     def slots(self, height: int, readout: float, trigger: float) -> tuple[Slot, ...]:
         """A slot per sample of the exposure, all of them scanning."""
-        rate = readout / height
         start = trigger - readout / 2
-        if self.direction == "up":
-            rate, start = -rate, start + rate * (height - 1)
         shifts = _band_times(self.samples, self.exposure * readout, 0.0)
-        return tuple(Slot(0, height, start + s, rate, 1.0 / self.samples) for s in shifts)
+        return tuple(Slot(0, height, start + s, readout / height, 1.0 / self.samples) for s in shifts)
 
 
 def _band_times(count: int, readout: float, trigger: float) -> list[float]:
