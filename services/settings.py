@@ -62,7 +62,7 @@ class Settings(BaseSettings):
     max_queued_per_owner: int = Field(default=10_000, ge=0, description="jobs of one owner that may wait; 0 = any")
     max_running_per_owner: int = Field(default=0, ge=0, description="jobs of one owner that may run at once; 0 = any")
     max_attempts: int = Field(default=3, ge=1, description="infrastructure failures that a job survives, plus one")
-    lease_seconds: float = Field(default=75.0, gt=0, description="silence after which a worker's job is given away")
+    lease_seconds: float = Field(default=60.0, gt=0, description="silence after which a worker's job is given away")
     heartbeat_seconds: float = Field(default=1.0, gt=0, description="seconds between two writes of a running job")
     stall_seconds: float = Field(default=900.0, gt=0, description="time without progress after which a job is killed")
     grace_seconds: float = Field(default=30.0, ge=0, description="seconds between asking a job to stop and killing it")

@@ -22,7 +22,7 @@ from services.store import schema
 from services.store.session import Store
 
 Found = TypeVar("Found")
-PATIENCE = 30.0
+PATIENCE = 120.0
 COMMANDS = {name: [sys.executable, "-m", f"services.{name}"] for name in ("api", "worker")}
 QUICK: dict[str, Any] = {  # the service's protocol in fractions of a second
     "lease_seconds": 30.0,
@@ -155,6 +155,8 @@ class Host:
         found = []
         for process in psutil.process_iter(["cmdline", "environ"]):
             command, env = process.info["cmdline"] or [], process.info["environ"] or {}
-            if "tests.system.quick_child" in command and env.get("RSAVATAR_HOME") == str(self.settings.home):
+            if {"tests.system.quick_child", "services.worker.child"} & set(command) and env.get("RSAVATAR_HOME") == str(
+                self.settings.home
+            ):
                 found.append(process)
         return found
