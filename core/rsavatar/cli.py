@@ -71,14 +71,6 @@ metres for millimetres, Rh taken for global_orient, files that are missing. Exit
 example:
   rsavatar data check data/CoreView_377
 """
-STUDIO = """\
-A painted person with a true motion before eight cameras, every row drawn at its own instant. Jobs on the subject
-"studio" make it by themselves; this verb makes one to look at, or another one.
-
-examples:
-  rsavatar data studio data/studio
-  rsavatar data studio data/tall --seed 3 --size 256 --frames 24
-"""
 LOGIN = """\
 Reads a token (from the terminal, or the first line of standard input), tries it, and keeps it in
 ~/.config/rsavatar/tokens.json for this address. RSAVATAR_TOKEN in the environment goes before what is kept.
@@ -177,14 +169,6 @@ def _add_local(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     cli_data.add_verbs(nouns, _add)
     correctors = verbs.add_parser("restore", help="train and score rolling-shutter correctors")
     cli_restore.add_verbs(correctors.add_subparsers(required=True, metavar="VERB"), _add)
-    studio = _add(
-        nouns, "studio", "rsavatar.cli_local:studio", "make the built-in subject, without any download", STUDIO
-    )
-    studio.add_argument("directory", type=Path, metavar="OUT")
-    studio.add_argument("--seed", type=int, default=0, help="motion, build and clothes (default: 0)")
-    studio.add_argument("--size", type=int, help="height and width of the pictures, pixels")
-    studio.add_argument("--frames", type=int, help="output frames")
-    studio.add_argument("--gamma", type=float, help="readout as a part of the frame period; 0 = global shutter")
 
 
 def _add_remote(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

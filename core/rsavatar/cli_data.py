@@ -40,6 +40,17 @@ example:
 """
 
 
+STUDIO = """\
+A painted person with a true motion before eight cameras, every row drawn at its own instant. Jobs on the subjects
+"studio" and "studio-N" make them by themselves; this verb makes one to look at, or another one.
+
+examples:
+  rsavatar data studio data/studio
+  rsavatar data studio data/boxer --seed 3 --size 512 --motion punch --clothes drawn --delta random
+  rsavatar data studio data/whole --source           sharp frames as well, for build-rs data/whole/source
+"""
+
+
 def add_verbs(nouns: object, add: AddVerb) -> None:
     """Teach the parser this file's verbs; ``add`` is the command line's own way to."""
     one = add(nouns, "build-rs", "rsavatar.cli_data:build_rs", "make a rolling-shutter subject of footage", BUILD)
@@ -49,10 +60,28 @@ def add_verbs(nouns: object, add: AddVerb) -> None:
     every.add_argument("source", type=Path, metavar="ROOT")
     for parser in (one, every):
         _add_settings(parser)
+    made = add(nouns, "studio", "rsavatar.cli_data:studio", "make a synthetic subject, without any download", STUDIO)
+    _add_studio(made)
     other = add(nouns, "convert", "rsavatar.cli_data:convert", "make our minimal folder of footage", CONVERT)
     other.add_argument("source", type=Path, metavar="SOURCE")
     other.add_argument("--views", default="", metavar="A,B:C,D", help="training : held-out cameras; rest = all others")
     other.add_argument("--out", type=Path, required=True, metavar="DIR")
+
+
+def _add_studio(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("directory", type=Path, metavar="OUT")
+    parser.add_argument("--seed", type=int, default=0, help="build, cameras, tempo, motion and clothes (default: 0)")
+    parser.add_argument("--size", type=int, help="height and width of the pictures, pixels (default: 160)")
+    parser.add_argument("--frames", type=int, help="output frames (default: 14)")
+    parser.add_argument("--gamma", type=float, help="readout as a part of the frame period; 0 = global shutter")
+    parser.add_argument("--K", type=int, dest="period", help="source frames per output frame (default: 11)")
+    parser.add_argument("--exposure", type=float, help="of every row, source frames (default: 0)")
+    parser.add_argument(
+        "--motion", help="wave, twist, march, punch or squat (default: one of the first three, by seed)"
+    )
+    parser.add_argument("--clothes", choices=["drawn"], help="of the seed's own (default: one of three sets, by seed)")
+    parser.add_argument("--delta", choices=["0", "random"], dest="triggers", help="trigger offsets of the cameras")
+    parser.add_argument("--source", action="store_true", help="write the sharp source frames of all cameras, too")
 
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
@@ -109,6 +138,20 @@ def build_zju(arguments: argparse.Namespace) -> int:
         )
     for each in built:
         print(each.folder)
+    return 0
+
+
+def studio(arguments: argparse.Namespace) -> int:
+    """``rsavatar data studio``: make a synthetic subject in a folder, and print the folder."""
+    from rsavatar.cli_progress import Display
+    from rsavatar.data.studio import Shoot, shoot
+    from rsavatar.events import to_json
+
+    names = ("seed", "size", "frames", "gamma", "period", "exposure", "motion", "clothes", "triggers", "source")
+    chosen = {name: value for name in names if (value := getattr(arguments, name)) is not None}
+    with Display() as display:
+        made = shoot(arguments.directory, Shoot(**chosen), lambda event: display.show(to_json(event)))
+    print(made)
     return 0
 
 

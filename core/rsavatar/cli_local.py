@@ -82,22 +82,6 @@ def check(arguments: argparse.Namespace) -> int:
     return 0 if report.ok else 1
 
 
-def studio(arguments: argparse.Namespace) -> int:
-    """``rsavatar data studio``: make the built-in subject in a folder, and print the folder."""
-    from rsavatar.cli_progress import Display
-    from rsavatar.data.studio import build
-    from rsavatar.events import to_json
-
-    named = {name: getattr(arguments, name) for name in ("size", "frames", "gamma")}
-    chosen = {name: value for name, value in named.items() if value is not None}
-    with Display() as display:
-        made = build(
-            arguments.directory, seed=arguments.seed, report=lambda event: display.show(to_json(event)), **chosen
-        )
-    print(made)
-    return 0
-
-
 @contextmanager
 def stop_on_signal() -> Iterator[threading.Event]:
     """An event that the first SIGINT or SIGTERM sets; the second acts as if nothing had been caught."""

@@ -22,7 +22,23 @@ from rsavatar.events import Note, Progress, to_json
 from rsavatar.spec import resolve
 from tests.core.live_service import Service, live_service
 
-VERBS = ["run", "bench", "data check", "data studio", "submit", "watch", "jobs", "table", "cancel", "retry", "subjects", "grid"]
+VERBS = [
+    "run",
+    "bench",
+    "data check",
+    "data studio",
+    "data build-rs",
+    "data build-zju",
+    "data convert",
+    "submit",
+    "watch",
+    "jobs",
+    "table",
+    "cancel",
+    "retry",
+    "subjects",
+    "grid",
+]
 
 
 def test_help_is_instant_because_nothing_heavy_is_imported() -> None:
@@ -41,7 +57,9 @@ def test_every_verb_explains_itself(verb: str, capsys: pytest.CaptureFixture[str
     assert max(map(len, text.splitlines())) <= 120
 
 
-@pytest.mark.parametrize("verb", ["", "run", "submit", "grid", "data check", "data studio"])
+@pytest.mark.parametrize(
+    "verb", ["", "run", "submit", "grid", "data check", "data studio", "data build-rs", "data convert"]
+)
 def test_help_teaches_by_examples_that_parse(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main([*verb.split(), "--help"])

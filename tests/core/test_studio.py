@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,9 +13,14 @@ import pytest
 from rsavatar.body.skinning import posed_vertices
 from rsavatar.data import studio
 from rsavatar.data.base import Array
+from rsavatar.data.build import Settings
+from rsavatar.data.build import build as build_rs
+from rsavatar.data.build_plan import Clock
+from rsavatar.data.footage_sources import open_footage
 from rsavatar.data.rolling import load
-from rsavatar.data.studio import build
-from rsavatar.data.studio_motion import bones, pose_meshes, skinning_table
+from rsavatar.data.studio import Shoot, build, shoot
+from rsavatar.data.studio_motion import STYLES, bones, pose_meshes, skinning_table
+from rsavatar.data.studio_paint import drawn_wardrobe
 from rsavatar.data.studio_render import Indices, Paint, Strip, draw
 from rsavatar.data.studio_stage import TRAINING, Stage, image_motion, row_times, set_stage
 from rsavatar.errors import DataError
@@ -208,12 +215,81 @@ def test_a_failed_build_leaves_nothing(tmp_path: Path, monkeypatch: pytest.Monke
 def test_the_cached_subject_is_built_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     built: list[Path] = []
 
-    def note(out: Path, *, seed: int) -> Path:
+    def note(out: Path, wanted: Shoot) -> Path:
         built.append(out)
         return out
 
     monkeypatch.setenv("RSAVATAR_CACHE", str(tmp_path))
-    monkeypatch.setattr(studio, "build", note)
+    monkeypatch.setattr(studio, "shoot", note)
     assert studio.studio_subject_dir().name == "studio"
     assert studio.studio_subject_dir(2).name == "studio-2"
     assert all(tmp_path in path.parents for path in built)
+
+
+@pytest.mark.parametrize("style", STYLES[3:])
+def test_other_motions_are_as_large(style: str) -> None:
+    stage = set_stage(3, 256, style, drawn_clothes=True)
+    assert stage.motion.style == style
+    assert 20 < image_motion(stage, np.arange(1.0, 15.0) * 11 + 5, 11.0).max() < 45
+
+
+def test_drawn_clothes_are_a_seeds_own() -> None:
+    drawn = [drawn_wardrobe(seed) for seed in range(6)]
+    assert len({wardrobe.shirt for wardrobe in drawn}) == 6
+    assert drawn_wardrobe(4) == drawn[4]
+    for wardrobe in drawn:
+        colours = [wardrobe.skin, wardrobe.hair, wardrobe.shirt, wardrobe.stripe, wardrobe.trousers, wardrobe.shoes]
+        assert all(0 <= part <= 1 for colour in colours for part in colour)
+
+
+def test_every_shutter_is_exact(tmp_path: Path) -> None:
+    """Another K, gamma, motion, clothes and triggers: rows of a triggered camera are rows of sharp pictures."""
+    wanted = Shoot(5, SIZE, 1, gamma=0.6, period=7, motion="punch", clothes="drawn", triggers="random")
+    subject = load(shoot(tmp_path / "s", wanted))
+    stage, mid = set_stage(5, SIZE, "punch", drawn_clothes=True), 10.0
+    late = subject.timing.trigger("02")
+    assert 0 < abs(late) <= 7 / 4
+    assert subject.timing.trigger("01") == 0  # held-out cameras show the mid frame itself
+    assert (subject.timing.readout_frames, subject.timing.mid_frames.tolist()) == (pytest.approx(4.2), [mid])
+    times = mid + late + 4.2 * (np.arange(SIZE) / SIZE - 0.5)
+    np.testing.assert_array_equal(subject.observe("02", 0)[0], stage.picture(stage.cameras[2], times)[0])
+    sharp = stage.picture(stage.cameras[2], np.full(SIZE, mid + late))[0]
+    np.testing.assert_array_equal(subject.truth("02", 0)[0], sharp)
+    assert shoot(tmp_path / "s", wanted) == tmp_path / "s"
+    with pytest.raises(DataError, match="something else"):
+        shoot(tmp_path / "s", replace(wanted, triggers="0"))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"motion": "fly"}, "one of wave"),
+        ({"size": 0}, "size at least 1"),
+        ({"size": 9999}, "4096"),
+        ({"seed": -1}, "seed"),
+    ],
+)
+def test_impossible_studios(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        Shoot(**wrong)
+
+
+def test_the_source_builds_to_nearly_the_same_subject(tmp_path: Path) -> None:
+    """Sharp frames and the builder against rows drawn at their own instants: the whole benchmark without any data."""
+    root = shoot(tmp_path / "s", Shoot(1, 96, 2, period=5, source=True))
+    footage = open_footage(root / "source")
+    assert (footage.length, footage.train, footage.test) == (16, ("00", "02", "04", "06"), ("01", "03", "05", "07"))
+    errors = {}
+    for name in ("flow", "copy"):
+        made = build_rs(footage, tmp_path / name, Settings(Clock(5), name), {}, 1)
+        built, exact = load(made), load(root)
+        assert built.timing.mid_frames.tolist() == exact.timing.mid_frames.tolist()
+        differences = []
+        for camera in exact.training:
+            rgb, mask = exact.observe(camera, 1)
+            off = built.observe(camera, 1)[0].astype(float) - rgb
+            differences.append(np.mean(off[mask > 0] ** 2))
+            np.testing.assert_array_equal(built.truth(camera, 1)[0], exact.truth(camera, 1)[0])
+        errors[name] = 10 * np.log10(255**2 / np.mean(differences))
+    assert errors["flow"] > errors["copy"] + 2
+    assert errors["flow"] > 30

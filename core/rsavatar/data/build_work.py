@@ -20,8 +20,8 @@ from rsavatar.data.build_motion import displacements
 from rsavatar.data.build_plan import Clock
 from rsavatar.data.build_rows import Reel, expose
 from rsavatar.data.footage import Footage
+from rsavatar.data.images import write_png
 from rsavatar.data.rolling import name_of
-from rsavatar.errors import DataError, expected
 from rsavatar.restore.interpolate import AbstractInterpolator, interpolator
 
 _CHUNK = 4  # output frames in one task
@@ -100,19 +100,6 @@ class Work:
         picture = make()
         for path, pixels in zip(paths, (picture[..., 2::-1], picture[..., 3]), strict=True):
             write_png(path, pixels)
-
-
-def write_png(path: Path, pixels: Bytes) -> None:
-    """Writes a picture whole or not at all.
-
-    Raises:
-        DataError: if there is no room.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.part.png")
-    if not cv2.imwrite(str(part), np.ascontiguousarray(pixels)):
-        raise DataError(expected(str(path), "room for a picture", "a failed write"))
-    part.replace(path)
 
 
 class Crew:

@@ -154,6 +154,19 @@ def read_frame(frame: Frame, lens: Lens) -> Image:
     return np.where(coverage[..., None] != 0, colours, 0).astype(np.uint8), coverage
 
 
+def write_png(path: Path, pixels: Bytes) -> None:
+    """Writes a picture whole or not at all.
+
+    Raises:
+        DataError: if there is no room.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.part.png")
+    if not cv2.imwrite(str(part), np.ascontiguousarray(pixels)):
+        raise DataError(expected(str(path), "room for a picture", "a failed write"))
+    part.replace(path)
+
+
 def fingerprint(root: Path, contents: Iterable[Path], sizes: Iterable[Path] = ()) -> str:
     """sha256 over files, in the order of their names relative to ``root``.
 

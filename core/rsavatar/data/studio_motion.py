@@ -69,7 +69,39 @@ _STYLES: tuple[tuple[str, Mapping[int, _Swing]], ...] = (
             6: ((0.04, 0.0, 0.0), (0.02, 0.12, 0.02), 0.79, 0.33),
         },
     ),
+    (
+        "punch",
+        {
+            16: ((0.0, -0.5, -0.45), (0.0, -0.55, 0.10), 1.05, 0.00),
+            17: ((0.0, 0.5, 0.45), (0.0, -0.55, -0.10), 1.05, 0.00),
+            18: ((0.0, -1.2, 0.0), (0.0, 0.75, 0.0), 1.05, 0.06),
+            19: ((0.0, 1.2, 0.0), (0.0, 0.75, 0.0), 1.05, 0.06),
+            3: ((0.05, 0.0, 0.0), (0.0, 0.16, 0.0), 1.05, 0.95),
+            6: ((0.05, 0.0, 0.0), (0.0, 0.16, 0.0), 1.05, 0.97),
+            1: ((-0.25, 0.1, 0.10), (0.08, 0.0, 0.0), 1.05, 0.20),
+            2: ((-0.10, -0.1, -0.10), (0.08, 0.0, 0.0), 1.05, 0.70),
+            4: ((0.40, 0.0, 0.0), (0.12, 0.0, 0.0), 1.05, 0.25),
+            5: ((0.30, 0.0, 0.0), (0.12, 0.0, 0.0), 1.05, 0.75),
+        },
+    ),
+    (
+        "squat",
+        {
+            1: ((-0.60, 0.0, 0.10), (-0.45, 0.0, 0.0), 0.72, 0.00),
+            2: ((-0.60, 0.0, -0.10), (-0.45, 0.0, 0.0), 0.72, 0.00),
+            4: ((0.90, 0.0, 0.0), (0.65, 0.0, 0.0), 0.72, 0.00),
+            5: ((0.90, 0.0, 0.0), (0.65, 0.0, 0.0), 0.72, 0.00),
+            3: ((0.15, 0.0, 0.0), (0.12, 0.0, 0.0), 0.72, 0.02),
+            16: ((0.0, -0.3, -0.55), (0.0, -0.3, 0.50), 0.72, 0.10),
+            17: ((0.0, 0.3, 0.55), (0.0, 0.3, -0.50), 0.72, 0.10),
+            18: ((0.0, -0.3, 0.0), (0.0, -0.2, 0.0), 0.72, 0.20),
+            19: ((0.0, 0.3, 0.0), (0.0, 0.2, 0.0), 0.72, 0.20),
+            15: ((0.0, 0.0, 0.0), (-0.12, 0.0, 0.0), 0.72, 0.05),
+        },
+    ),
 )
+STYLES = tuple(name for name, _ in _STYLES)
+_BY_SEED = 3  # a seed's own style is one of the first three
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,10 +132,13 @@ class Motion:
         return BodyFit(poses.reshape(-1, 3 * JOINTS), Rh, np.column_stack(sway), self.shapes)
 
 
-def choose_motion(body: BodyModel, seed: int) -> Motion:
-    """The motion of a seed: one of three styles in turn, with its own tempo, phases, amplitudes and build."""
+def choose_motion(body: BodyModel, seed: int, wanted: str = "") -> Motion:
+    """The motion of a seed: one of three styles in turn, with its own tempo, phases, amplitudes and build.
+
+    ``wanted`` names another of ``STYLES``.
+    """
     rng = np.random.default_rng([seed, 7])
-    style, swings = _STYLES[seed % len(_STYLES)]
+    style, swings = _STYLES[STYLES.index(wanted) if wanted else seed % _BY_SEED]
     rest, swing = np.zeros((JOINTS, 3)), rng.normal(0, 0.02, (JOINTS, 3))
     rate, phase = rng.uniform(0.5, 1.0, (JOINTS, 1)), rng.uniform(0, 1, (JOINTS, 1))
     tempo, offset = rng.uniform(0.95, 1.05), rng.uniform(0, 1)

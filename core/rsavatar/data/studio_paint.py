@@ -24,6 +24,8 @@ class Wardrobe:
     stripe: tuple[float, float, float]
     trousers: tuple[float, float, float]
     shoes: tuple[float, float, float]
+    sleeve: float = 0.65  # where on the forearm the sleeve ends: 0 elbow, 1 wrist
+    leg: float = 1.0  # where on the shin the trousers end: 0 knee, 1 ankle
 
 
 WARDROBES = (
@@ -53,6 +55,29 @@ WARDROBES = (
     ),
 )
 _LIGHT = np.array([0.35, 0.75, 0.55]) / np.linalg.norm([0.35, 0.75, 0.55])
+
+
+def drawn_wardrobe(seed: int) -> Wardrobe:
+    """Clothes of a seed's own: any skin, hair and colours, short or long sleeves and legs."""
+    rng = np.random.default_rng([seed, 19])
+
+    def colour(low: float, high: float) -> tuple[float, float, float]:
+        red, green, blue = rng.uniform(low, high, 3)
+        return float(red), float(green), float(blue)
+
+    light = rng.uniform(0.35, 1.0)
+    skin = (0.93 * light, (0.55 + 0.21 * light) * light, (0.42 + 0.24 * light) * light)
+    hair = rng.uniform(0.05, 0.7)
+    return Wardrobe(
+        skin=(float(skin[0]), float(skin[1]), float(skin[2])),
+        hair=(float(hair), float(0.7 * hair), float(0.4 * hair)),
+        shirt=colour(0.45, 0.95),
+        stripe=colour(0.05, 0.45),
+        trousers=colour(0.1, 0.55),
+        shoes=colour(0.1, 0.9),
+        sleeve=float(rng.choice([0.0, 0.3, 0.65, 0.95])),
+        leg=float(rng.choice([0.2, 1.0])),
+    )
 
 
 def painter(rest: Array, faces: Indices, joints: Array, wardrobe: Wardrobe) -> Paint:
@@ -96,8 +121,9 @@ def _base_colour(p: Array, joints: Array, w: Wardrobe) -> Array:
     colour = np.tile(np.array(w.skin), (len(p), 1))
     freckles = 0.93 + 0.07 * np.sign(np.sin(140 * x) * np.sin(150 * y) * np.sin(130 * z))
     colour *= freckles[:, None]
-    cuff = 0.35 * abs(joints[18, 0]) + 0.65 * abs(joints[20, 0])
-    collar, waist, hem = joints[12, 1] + 0.01, joints[3, 1] - 0.02, joints[7, 1] + 0.06
+    cuff = (1 - w.sleeve) * abs(joints[18, 0]) + w.sleeve * abs(joints[20, 0])
+    collar, waist = joints[12, 1] + 0.01, joints[3, 1] - 0.02
+    hem = joints[7, 1] + 0.06 + (1 - w.leg) * (joints[4, 1] - joints[7, 1])
     shirt = (y < collar) & (y > waist) & (side < cuff)
     _put(colour, shirt, _shirt(x, y, z, side, joints, w))
     _put(colour, (y <= waist) & (y > hem), _trousers(x, y, z, w))

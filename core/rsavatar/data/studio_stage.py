@@ -10,7 +10,7 @@ from rsavatar.body.anny import anny_body
 from rsavatar.body.base import BodyModel
 from rsavatar.data.base import Array, BodyFit, Bytes, Image
 from rsavatar.data.studio_motion import Motion, bones, choose_motion, pose_meshes, skinning_table
-from rsavatar.data.studio_paint import WARDROBES, painter
+from rsavatar.data.studio_paint import WARDROBES, drawn_wardrobe, painter
 from rsavatar.data.studio_render import Paint, Strip, draw
 from rsavatar.geometry.cameras import Camera
 
@@ -55,12 +55,16 @@ def _mean(images: list[Bytes]) -> Bytes:
     return mean
 
 
-def set_stage(seed: int, size: int) -> Stage:
-    """The person, the motion and the cameras of a seed; converts the free body if it is not cached."""
+def set_stage(seed: int, size: int, style: str = "", drawn_clothes: bool = False) -> Stage:
+    """The person, the motion and the cameras of a seed; converts the free body if it is not cached.
+
+    ``style`` names another motion than the seed's own, ``drawn_clothes`` are the seed's alone.
+    """
     body = anny_body()
-    motion = choose_motion(body, seed)
+    motion = choose_motion(body, seed, style)
     rest, joints = body.shaped(motion.shapes), body.rest_joints(motion.shapes)
-    paint = painter(rest, body.faces, joints, WARDROBES[seed % len(WARDROBES)])
+    clothes = drawn_wardrobe(seed) if drawn_clothes else WARDROBES[seed % len(WARDROBES)]
+    paint = painter(rest, body.faces, joints, clothes)
     return Stage(body, motion, paint, skinning_table(rest, body.weights), _ring(seed, size))
 
 
