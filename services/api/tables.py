@@ -83,6 +83,7 @@ def to_row(entry: TableEntry) -> Row:
         renders=_an_image(work, "drawn_passes"),
         paper_renders=_an_image(work, "paper_passes"),
         settings=settings_of(entry.job.spec),
+        restorer=str(entry.provenance.get("restorer") or ""),
     )
 
 

@@ -202,3 +202,12 @@ def test_unknown_names_and_formats_are_refused() -> None:
 def test_needs_the_standard_library_only() -> None:
     code = "import rsavatar.report.tables, sys; print(sorted({'torch', 'numpy', 'pydantic'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+def test_what_corrected_the_pictures_is_named_below_the_table() -> None:
+    rows = [
+        row("gauhuman", "wave", 20.0),
+        row("cvr+gauhuman", "wave", 21.0, restorer="cvr version 1, reduced, sha256 ab"),
+    ]
+    assert "CVR + GauHuman: pictures corrected by cvr version 1, reduced, sha256 ab." in render_main(rows, "md")
+    assert "pictures corrected" not in render_main(rows[:1], "md")

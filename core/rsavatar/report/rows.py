@@ -36,6 +36,7 @@ class Row:
     renders: float | None = None  # passes of the renderer a step
     paper_renders: float | None = None  # full frames that the paper's way would render a step
     settings: Settings = ()
+    restorer: str = ""  # what corrected the pictures first, weights included; empty for one-stage methods
 
     def word(self, name: str) -> str:
         """One of the settings; empty if it has none of this name."""

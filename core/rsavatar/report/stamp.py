@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from rsavatar.report.cells import Line
 from rsavatar.report.formats import Cell, Column, Table
-from rsavatar.report.rows import Row
+from rsavatar.report.rows import LABELS, Row
 
 OF_THE_SUBJECT = frozenset({"cameras", "frames"})  # words of a protocol that differ between subjects by nature
 
@@ -45,6 +45,8 @@ def notes_on(rows: Sequence[Row], lines: Iterable[Sequence[Cell]]) -> list[str]:
         notes.append(f"Iterations differ between jobs: {', '.join(map(str, budgets))}.")
     if len({protocol_of(row) for row in rows}) > 1:
         notes.append("Metric protocols differ between jobs; see the provenance.")
+    for method, restorer in sorted({(row.method, row.restorer) for row in rows if row.restorer}):
+        notes.append(f"{LABELS.get(method, method)}: pictures corrected by {restorer}.")
     if any(cell.std is not None for line in lines for cell in line):
         notes.append("± is the sample standard deviation over seeds.")
     return notes

@@ -56,9 +56,10 @@ class FlowCorrector(AbstractCorrector):
 
     @property
     def identity(self) -> str:
-        """Algorithm and settings."""
-        words = " ".join(f"{name} {value:g}" for name, value in asdict(self._settings).items())
-        return f"dense flow (DIS), no weights, version {FORMAT}: {words}"
+        """Algorithm, and settings that are not the usual ones."""
+        usual = asdict(Settings())
+        words = [f", {name} {value:g}" for name, value in asdict(self._settings).items() if value != usual[name]]
+        return f"dense flow (DIS) without weights, version {FORMAT}{''.join(words)}"
 
     def restore(self, shot: Shot) -> Picture:
         """See the contract."""
