@@ -3,7 +3,9 @@
 # make test   set up, run all tests
 # make check  format, lint, types, import contracts
 # make check-native  the kernels under address, undefined-behaviour and thread sanitizers
+# make soak   a thousand small trainings while something is killed every few seconds; SOAK='--jobs 100 --postgresql'
 # make bench  the long measurements; results in docs/benchmarks
+# make screenshots URL=http://127.0.0.1:8000   every page of a running service, into docs/screens
 # make studies  ablation, calibration, exposure, losses, robustness, superres: hours; JOBS=N at a time, SUBJECTS='DIR ...'
 
 PYTHON ?= python3
@@ -11,7 +13,7 @@ BIN := .venv/bin
 SETUP := .venv/.complete
 JOBS ?= 1
 
-.PHONY: setup demo up test check check-native bench clean studies
+.PHONY: setup demo up test check check-native soak bench screenshots clean studies
 .DEFAULT_GOAL := help
 
 help:
@@ -44,17 +46,25 @@ check: $(SETUP)
 check-native: $(SETUP)
 	$(BIN)/python -m tests.native.sanitize
 
+soak: $(SETUP)
+	$(BIN)/python -m tests.system.soak $(SOAK)
+
 bench: $(SETUP)
 	$(BIN)/rsavatar bench render --json docs/benchmarks/render.json
 	$(BIN)/rsavatar bench growth --json docs/benchmarks/growth.json
 	$(BIN)/rsavatar bench train --json docs/benchmarks/train.json
 	$(BIN)/rsavatar bench stability --json docs/benchmarks/stability.json
+	$(BIN)/python -m services.bench --json docs/benchmarks/service.json
 
 studies: $(SETUP)
 	for name in ablation calibration losses robustness superres; do \
 		$(BIN)/rsavatar bench $$name --jobs $(JOBS) $(if $(SUBJECTS),--subjects $(SUBJECTS)) --json docs/benchmarks/$$name.json || exit 1; \
 	done
 	$(BIN)/rsavatar bench exposure --jobs $(JOBS) --json docs/benchmarks/exposure.json
+
+URL ?= http://127.0.0.1:8000
+screenshots: $(SETUP)
+	$(BIN)/python docs/screenshots.py $(URL)
 
 clean:
 	rm -rf .venv build core/*.egg-info core/rsavatar/render/_kernels_*.so

@@ -38,6 +38,7 @@ WIDTHS = {"wide": 1440, "narrow": 390}
 SCHEMES = ("light", "dark")
 TALLEST = 6000
 QUALITY = 84  # of a stored picture
+NOBODY = "00000000-0000-0000-0000-000000000000"
 DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 
 
@@ -59,13 +60,17 @@ def ask(url: str) -> Any:
 def pages(base: str, subject: str) -> dict[str, str]:
     """Name to address of everything that is to be shown; what has no example yet is left out."""
     found = {"home": "/", "jobs": "/jobs", "new": "/jobs/new", "grids": "/grids", "figures": "/figures"}
-    found |= {"benchmarks": "/benchmarks", "subjects": "/subjects", "error": "/jobs/00000000-0000-0000-0000-000000000000"}
-    done = ask(f"{base}/api/v1/jobs?state=succeeded&subject={subject}&limit=200")["items"]
-    newest = {job["method"]: job["id"] for job in reversed(done)}
-    if "rs-avatar" in newest:
-        found |= {"job": f"/jobs/{newest['rs-avatar']}", "viewer": f"/jobs/{newest['rs-avatar']}/viewer"}
-    if len(newest) > 1:
-        found["compare"] = "/jobs/compare?" + "&".join(f"id={job}" for job in list(newest.values())[:4])
+    found |= {
+        "benchmarks": "/benchmarks",
+        "subjects": "/subjects",
+        "error": "/jobs/00000000-0000-0000-0000-000000000000",
+    }
+    done = ask(f"{base}/api/v1/jobs?state=succeeded&subject={subject}&sort=-psnr&limit=200")["items"]
+    best = {job["method"]: job["id"] for job in reversed(done)}
+    if "rs-avatar" in best:
+        found |= {"job": f"/jobs/{best['rs-avatar']}", "viewer": f"/jobs/{best['rs-avatar']}/viewer"}
+    if len(best) > 1:
+        found["compare"] = "/jobs/compare?" + "&".join(f"id={job}" for job in list(best.values())[:4])
     if grids := ask(f"{base}/api/v1/grids?limit=1")["items"]:
         found["grid"] = f"/grids/{grids[0]['id']}"
     return found

@@ -40,9 +40,11 @@ class Grid:
         """How many columns come before the paper's."""
         return next((i for i, title in enumerate(self.header) if title.startswith(PAPER)), len(self.header))
 
-    def shows(self, column: int) -> bool:
-        """Whether any row has something in ``column``."""
-        return any(row[column][0] not in {"–", ""} for row in self.rows)
+    @property
+    def shown(self) -> tuple[int, ...]:
+        """Columns in which any row has something."""
+        columns = range(len(self.header))
+        return tuple(i for i in columns if any(row[i][0] not in {"–", ""} for row in self.rows))
 
 
 def to_grid(markdown: str) -> Grid:
