@@ -128,6 +128,7 @@ class JobSpec(BaseModel):
     densify: bool = Field(True, description="adaptive density control: clone, split, prune")
     checkpoint_every: int = Field(1000, ge=1, description="steps between checkpoints")
 
+    blur_triggers: bool = Field(False, description="mad-avatar is told the triggers, which its formula has no place for")
     skip: tuple[Skip, ...] = Field(SKIPS, description="work left out where the scene does not need it")
     calibrate: tuple[Unknown, ...] = Field((), description="what of the schedule is learned: readout, trigger")
     exposure_frames: float | None = Field(
@@ -149,6 +150,8 @@ class JobSpec(BaseModel):
             raise ValueError(expected("ablation.no_reg", "motion frame-spline, which has a penalty", repr(self.motion)))
         if self.knots != 1 and self.motion != "sequence-spline":
             raise ValueError(expected("knots", "1, or motion sequence-spline", self.knots))
+        if self.blur_triggers and self.method != "mad-avatar":
+            raise ValueError(expected("blur_triggers", "mad-avatar, whose blur they would move", self.method))
         if self.T == "scanline" and self.method == "mad-avatar":
             raise ValueError(expected("T", "a finite number of renders for mad-avatar to average", "'scanline'"))
         self._check_schedule()

@@ -107,6 +107,7 @@ def test_the_hash_ignores_how_a_job_runs_and_nothing_else() -> None:
         "mask_weight": 0.25, "densify": False, "checkpoint_every": 7, "ablation": {"no_rs": True},
         "calibrate": ["readout"], "exposure_samples": 2, "doubt": False, "disturb": {"masks": 0.1},
         "exposure_frames": 0.0, "ssim_weight": 0.2, "residual": "additive", "knots": 2, "skip": ["body"],
+        "blur_triggers": True,
     }  # fmt: skip
     names = {field.alias or name for name, field in JobSpec.model_fields.items()}
     assert set(changes) == names - NOT_OF_RESULT  # a new word must be given a change here
@@ -115,7 +116,11 @@ def test_the_hash_ignores_how_a_job_runs_and_nothing_else() -> None:
     apart = {"priority": 9, "memory_limit_mb": 4000, "stall_seconds": 60.0}
     assert set(apart) == NOT_OF_RESULT
     assert JobSpec.model_validate({**base, **apart}).sha256() == original
-    hashes = {name: JobSpec.model_validate({**base, name: value}).sha256() for name, value in changes.items()}
+    needs = {"blur_triggers": {"method": "mad-avatar"}}
+    hashes = {
+        name: JobSpec.model_validate({**base, name: value, **needs.get(name, {})}).sha256()
+        for name, value in changes.items()
+    }
     assert original not in hashes.values()
     assert len(set(hashes.values())) == len(hashes)
 

@@ -9,12 +9,12 @@ from rsavatar.shutter.rolling import Blur
 
 
 class BlurAvatar(AbstractMethod):
-    """Differs from the paper's rolling-shutter model in the operator alone."""
+    """Differs from the paper's rolling-shutter model in the operator alone; triggers belong to the operator."""
 
     def motion(self, case: Case) -> AbstractMotion:
         """The same as ``RollingShutterAvatar``'s."""
         return sub_frame_motion(case)
 
     def shutter(self, case: Case) -> AbstractShutter:
-        """The mean of T instants over the readout."""
-        return Blur(case.bands)
+        """The mean of T instants over the readout, without the triggers unless the spec gives them."""
+        return Blur(case.bands, synchronised=not case.spec.blur_triggers)

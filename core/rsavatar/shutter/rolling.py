@@ -19,13 +19,18 @@ class Instant(AbstractShutter):
 
 @dataclass(frozen=True)
 class Blur(AbstractShutter):
-    """MAD-Avatar's operator: the mean of ``instants`` whole images over the readout (paper, eq. blur)."""
+    """MAD-Avatar's operator: the mean of ``instants`` whole images over the readout (paper, eq. blur).
+
+    Its instants t_i carry no camera in the paper, nor in its authors' code: where cameras are taken to be
+    ``synchronised``, their triggers are not looked at.
+    """
 
     instants: int
+    synchronised: bool = False
 
     def slots(self, height: int, readout: float, trigger: float) -> tuple[Slot, ...]:
         """A slot per instant, all of them over all rows."""
-        times = _band_times(self.instants, readout, trigger)
+        times = _band_times(self.instants, readout, 0.0 if self.synchronised else trigger)
         return tuple(Slot(0, height, t, weight=1.0 / self.instants) for t in times)
 
 
