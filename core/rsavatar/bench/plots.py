@@ -15,8 +15,8 @@ STEPS: dict[str, tuple[str, tuple[int, int], str]] = {  # of own time: label, it
     "own-time": ("own time", (-6, 0), "right"),
     "own-time+shear": ("+ shear, implicit", (-6, 0), "right"),
     "scanline": ("scanline", (-6, 0), "right"),
-    "scanline-5": ("fifth node", (7, 2), "left"),
-    "scanline-5-fine": ("strips of 4 rows", (7, -10), "left"),
+    "scanline-coarse": ("strips of 16 rows", (7, 2), "left"),
+    "scanline-fine": ("strips of 4 rows", (7, -10), "left"),
 }
 
 

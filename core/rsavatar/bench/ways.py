@@ -54,10 +54,11 @@ def scan(height: int, name: str = "scanline", label: str = "scanline", *without:
 def all_ways(height: int, K: int) -> list[Way]:
     """Every way for K source frames per frame: T = 1, the paper's, bands from K to H, and own time step by step.
 
-    The last two spend more than the default scanline does: a fifth pose node, then a depth order every 4 rows.
+    The last three are the scanline with one thing changed: a pose node less, strips twice and half as high.
     """
-    fifth = replace(scan(height, "scanline-5", "+ a fifth pose node"), nodes=5)
-    fine = replace(fifth, name="scanline-5-fine", label="+ strips of 4 rows", options=Options(strip_rows=4))
+    fewer = replace(scan(height, "scanline-4", "scanline, four pose nodes"), nodes=4)
+    coarse = replace(scan(height, "scanline-coarse", "scanline, strips of 16 rows"), options=Options(strip_rows=16))
+    fine = replace(scan(height, "scanline-fine", "scanline, strips of 4 rows"), options=Options(strip_rows=4))
     finer = sorted({min(T, height) for T in (K, 2 * K, 4 * K, 16 * K, height)})
     return [
         global_shutter(height),
@@ -66,7 +67,8 @@ def all_ways(height: int, K: int) -> list[Way]:
         scan(height, "own-time", "own time only", "shear", "implicit", "resort"),
         scan(height, "own-time+shear", "+ shear, implicit derivative", "resort"),
         scan(height, "scanline", "+ depth re-sort (scanline)"),
-        fifth,
+        fewer,
+        coarse,
         fine,
     ]
 
