@@ -37,7 +37,7 @@ class Doubt:
             cameras: [count] index of each image's camera: what cameras see differs in size and detail.
         """
         ratio = torch.full_like(self.losses, torch.nan)
-        for camera in cameras.unique():
+        for camera in set(cameras.tolist()):
             of = (cameras == camera) & ~self.doubted & self.losses.isfinite()
             ratio[of] = self.losses[of] / self.losses[of].median() if bool(of.any()) else torch.nan
         room = int(SHARE * len(self.losses)) - int(self.doubted.sum())

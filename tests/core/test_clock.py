@@ -98,9 +98,9 @@ def moving(case: Case) -> Actor:
     g = torch.Generator().manual_seed(0)
     with torch.no_grad():
         actor.avatar.opacity_logits.fill_(2.0)
-        actor.avatar.sh_constant += torch.randn(actor.avatar.sh_constant.shape, generator=g)
+        actor.avatar.sh_constant.add_(torch.randn(actor.avatar.sh_constant.shape, generator=g))
         control = next(actor.motion.parameters())
-        control += 0.15 * torch.randn(control.shape, generator=g)
+        control.add_(0.15 * torch.randn(control.shape, generator=g))
     return actor
 
 

@@ -31,7 +31,7 @@ def test_value_and_gradient_equal_torch(size: tuple[int, int], background: float
             coverage = mask.to(dtype) / 255
             error = rgb + background * transmittance - target.to(dtype) / 255 - background * (1 - coverage)
             value = error.abs().mean() + mask_weight * (1 - transmittance - coverage).abs().mean()
-        (3 * value).backward()
+        (3 * value).backward()  # type: ignore[no-untyped-call]
         results.append((value.detach(), rgb.grad, transmittance.grad))
     assert float(results[0][0]) == pytest.approx(float(results[1][0]), rel=1e-6)
     for got, want in zip(results[0][1:], results[1][1:], strict=True):
