@@ -40,7 +40,7 @@ class Rates:
     motion: float = 1e-3  # control points and shape; falls to 1/100 of itself, log-linearly
     pose_residual: float = 5e-5
     skin_offset: float = 5e-4  # one step a block, on the sum of its gradients
-    clock: float = 2e-3  # readouts as a part of themselves, triggers in periods; falls to 1/100 as the motion's
+    clock: float = 8e-3  # readouts as a part of themselves, triggers in periods; falls to 1/100 as the motion's
     largest: float = math.inf  # metres
 
 
