@@ -60,6 +60,7 @@ studies: $(SETUP)
 	for name in ablation calibration losses robustness superres; do \
 		$(BIN)/rsavatar bench $$name --jobs $(JOBS) $(if $(SUBJECTS),--subjects $(SUBJECTS)) --json docs/benchmarks/$$name.json || exit 1; \
 	done
+	$(BIN)/rsavatar bench restore --jobs $(JOBS) $(if $(SUBJECTS),--subjects $(SUBJECTS)) --json docs/benchmarks/restoration.json
 	$(BIN)/rsavatar bench exposure --jobs $(JOBS) --json docs/benchmarks/exposure.json
 
 URL ?= http://127.0.0.1:8000
