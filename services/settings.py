@@ -6,6 +6,7 @@ import hashlib
 import os
 import sys
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,6 +15,7 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from services.errors import SettingsError
 
+SECRETS = ("DATABASE_URL", "BROKER_URL")
 LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
 LONGEST_SOCKET_PATH = 100  # sun_path holds 108 bytes on Linux, 104 on macOS
 ROOT = Path(__file__).resolve().parent.parent  # children are started here, where `services` can be imported
@@ -159,6 +161,12 @@ def read_settings() -> Settings:
         first = error.errors()[0]
         name = "RSAVATAR_" + str(first["loc"][0]).upper()
         raise SettingsError(name, first["msg"].lower(), repr(first["input"])) from None
+
+
+def without_secrets(environment: Mapping[str, str]) -> dict[str, str]:
+    """What processes get that compute or draw: not the addresses of the stores, nor keys to a bucket."""
+    withheld = {f"RSAVATAR_{name}{suffix}" for name in SECRETS for suffix in ("", "_FILE")}
+    return {k: v for k, v in environment.items() if k not in withheld and not k.startswith("AWS_")}
 
 
 def from_files() -> dict[str, Any]:

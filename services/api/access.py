@@ -14,8 +14,9 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any
 from urllib.parse import parse_qs
 
-from fastapi import Depends, FastAPI, Request
+from fastapi import Depends, FastAPI, Request, Security
 from fastapi.routing import iter_route_contexts
+from fastapi.security import HTTPBearer
 from starlette.exceptions import HTTPException
 
 from services.errors import ForbiddenError
@@ -81,6 +82,9 @@ async def known_caller(request: Request) -> Caller:
 Who = Annotated[Caller, Depends(known_caller)]
 
 
+Shown = Annotated[object, Security(HTTPBearer(auto_error=False, description="rsavatar token create"))]  # in OpenAPI
+
+
 @dataclass(frozen=True)
 class Needs:
     """A dependency that lets in who has a scope: ``looking`` to change nothing, ``changing`` for all else."""
@@ -88,7 +92,7 @@ class Needs:
     looking: Scope
     changing: Scope
 
-    async def __call__(self, request: Request) -> None:
+    async def __call__(self, request: Request, bearer: Shown) -> None:
         """Let the caller pass.
 
         Raises:

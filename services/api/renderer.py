@@ -21,10 +21,9 @@ from typing import Any, Literal
 
 from rsavatar.errors import SpecError
 from services.errors import ConflictError, RenderError
-from services.settings import ROOT, Settings
+from services.settings import ROOT, Settings, without_secrets
 
 Lane = Literal["views", "files"]
-SECRETS = ("RSAVATAR_DATABASE_URL", "RSAVATAR_BROKER_URL")  # drawing needs neither
 LARGEST_ANSWER = 1 << 30
 ENDED = (EOFError, ConnectionError, OSError)
 
@@ -94,7 +93,7 @@ class RenderProcess:
     def _start(self) -> Connection:
         ours, theirs = socket.socketpair()
         threads = str(self._settings.threads)
-        env = {key: value for key, value in os.environ.items() if key not in SECRETS}
+        env = without_secrets(os.environ)
         env |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RSAVATAR_THREADS"), threads)
         env["MPLCONFIGDIR"] = str(self._settings.home / "run" / "matplotlib")  # its list of fonts; a home is writable
         words = (str(theirs.fileno()), str(self._settings.render_idle_seconds))

@@ -11,9 +11,7 @@ from collections.abc import Mapping
 from typing import IO, Any
 
 from services.process import signal_group
-from services.settings import ROOT, Settings
-
-SECRETS = ("RSAVATAR_DATABASE_URL", "RSAVATAR_BROKER_URL")  # a job needs neither
+from services.settings import ROOT, Settings, without_secrets
 
 
 def end(child: subprocess.Popen[bytes], patience: float) -> None:
@@ -59,7 +57,7 @@ def launch(settings: Settings, order: Mapping[str, Any], log_file: IO[bytes]) ->
 def child_environment(settings: Settings) -> dict[str, str]:
     """Environment of a job. OpenMP and BLAS read theirs once, when the process starts, so it is set here."""
     threads = str(settings.threads)
-    env = {key: value for key, value in os.environ.items() if key not in SECRETS}
+    env = without_secrets(os.environ)
     counts = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RSAVATAR_THREADS")
     env |= dict.fromkeys(counts, threads)
     return env | {"OMP_WAIT_POLICY": "passive", "MALLOC_ARENA_MAX": "2", "PYTHONUNBUFFERED": "1"}

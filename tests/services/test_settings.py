@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,7 @@ import pytest
 
 from services import redis_server
 from services.errors import BrokerError, SettingsError
-from services.settings import LONGEST_SOCKET_PATH, Settings, read_settings
+from services.settings import LONGEST_SOCKET_PATH, Settings, read_settings, without_secrets
 
 
 def test_environment_is_read_under_the_prefix(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -64,3 +65,21 @@ def test_private_server_has_no_port_and_loses_nothing(tmp_path: Path) -> None:
     assert options["--appendonly"] == "yes"
     assert options["--maxmemory-policy"] == "noeviction"
     assert settings.socket.parent.stat().st_mode & 0o777 == 0o700
+
+
+def test_secrets_come_from_files_and_go_to_no_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "url"
+    file.write_text("redis://:word@redis:6379/0\nand a second line\n")
+    monkeypatch.setenv("RSAVATAR_BROKER_URL_FILE", str(file))
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "key")
+    assert read_settings().broker == "redis://:word@redis:6379/0"
+    given = without_secrets(os.environ)
+    assert not [name for name in given if "BROKER" in name or name.startswith("AWS_")]
+    assert given["PATH"] == os.environ["PATH"]
+    monkeypatch.setenv("RSAVATAR_BROKER_URL", "redis://other")
+    with pytest.raises(SettingsError, match="RSAVATAR_BROKER_URL: expected nothing, because"):
+        read_settings()
+    monkeypatch.delenv("RSAVATAR_BROKER_URL")
+    file.unlink()
+    with pytest.raises(SettingsError, match="RSAVATAR_BROKER_URL_FILE: expected a readable file"):
+        read_settings()

@@ -1,4 +1,4 @@
-"""The programs of a deployment with tokens asked for: the first one is issued once, uploads are checked by the worker."""
+"""The programs of a deployment with tokens asked for: the first is issued once, uploads are checked by the worker."""
 
 from __future__ import annotations
 
