@@ -17,7 +17,7 @@ import torch
 from rsavatar import kernels
 from rsavatar.bench import page, results, tables
 from rsavatar.bench.machine import describe
-from rsavatar.bench.memory import render_mb
+from rsavatar.bench.memory import render_mb, training_mb
 from rsavatar.bench.results import Curve, GrowthResult, Point, Ratio, Target
 from rsavatar.bench.scene import Size, build
 from rsavatar.bench.timing import interleave, narrate, ratio
@@ -36,6 +36,7 @@ class Plan:
     whole: tuple[int, ...] = (1, 2, 5, 11, 22)  # bands of the paper's way
     frames: tuple[int, ...] = (4, 20, 100, 500)
     memory_bands: tuple[int, ...] = (1, 11, 44, 176, 1024)  # none: memory is not measured
+    memory_steps: tuple[int, ...] = (200, 500, 1000, 2000)  # of training
     K: int = 11
     rounds: int = 11
     step_rounds: int = 41
@@ -157,7 +158,17 @@ def _memory(plan: Plan) -> list[Curve]:
     return [
         Curve(axis="memory", name="bands", fixed=fixed, points=bands),
         Curve(axis="memory", name="scanline", fixed=fixed, points=flat),
+        _memory_of_steps(plan),
     ]
+
+
+def _memory_of_steps(plan: Plan) -> Curve:
+    """Memory of a process by the number of training steps that it has taken."""
+    narrate("memory over training steps")
+    grown = training_mb(plan.size, plan.memory_steps)
+    points = [Point(x=steps, memory_mb=mb) for steps, mb in zip(plan.memory_steps, grown, strict=True)]
+    fixed = f"the whole process, {plan.size.gaussians} Gaussians, {plan.size.pixels} x {plan.size.pixels} px"
+    return Curve(axis="steps", name="training", fixed=fixed, points=points)
 
 
 def _frames(plan: Plan) -> Curve:
@@ -193,5 +204,7 @@ def _targets(steps: dict[str, list[float]], ratios: list[Ratio], curves: list[Cu
     if memory:
         whole, most = memory["bands"][0], memory["bands"][-1]
         found.append(Target.at_most(1.2, memory["scanline"][0] / whole, "peak memory, scanline / one whole image"))
+        held = [p.memory_mb or 0.0 for c in curves if c.axis == "steps" for p in c.points]
+        found.append(Target.at_most(1.02, held[-1] / held[0], "memory, last training step / 200th"))
         found.append(Target.at_most(1.2, most / whole, "peak memory, bands T = H / one whole image"))
     return found

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 
+from rsavatar import kernels
 from rsavatar.bench.scene import Size, build
 from rsavatar.bench.ways import Exposure, in_bands, scan
+from rsavatar.optimization import BLOCK
 
 MB = 1e6
 
@@ -22,6 +25,28 @@ def render_mb(size: Size, bands: int | None) -> float:
     arguments = [str(size.gaussians), str(size.pixels), str(bands or 0)]
     command = [sys.executable, "-m", __name__, *arguments]
     return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+
+def training_mb(size: Size, steps: Sequence[int]) -> list[float]:
+    """MB of resident memory of a process that trains, after each number of ``steps`` (rising)."""
+    arguments = [str(size.gaussians), str(size.pixels), "train", *map(str, steps)]
+    command = [sys.executable, "-m", __name__, *arguments]
+    return [float(x) for x in subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()]
+
+
+def _train(size: Size, steps: Sequence[int]) -> list[float]:
+    from rsavatar.bench.training import Training  # it imports much that a render does without
+
+    torch.set_num_threads(1)
+    kernels.keep_memory()
+    training, found = Training(size, scan(size.pixels)), []
+    for step in range(1, max(steps) + 1):
+        training.step()
+        if step % BLOCK == 0:
+            training.refresh()
+        if step in steps:
+            found.append(_status("VmRSS") / MB)
+    return found
 
 
 def _measure(size: Size, bands: int) -> float:
@@ -45,4 +70,5 @@ def _status(name: str) -> float:
 
 
 if __name__ == "__main__":
-    print(_measure(Size(int(sys.argv[1]), int(sys.argv[2])), int(sys.argv[3])))
+    of, what = Size(int(sys.argv[1]), int(sys.argv[2])), sys.argv[3]
+    print(*_train(of, [int(n) for n in sys.argv[4:]])) if what == "train" else print(_measure(of, int(what)))

@@ -101,7 +101,7 @@ def _growth(axis: str, curves: Sequence[Curve], folder: Path) -> str:
         panel.set_ylim(low / 2, high * 10 / (high / low))
     panel.legend(fontsize=7.5, frameon=False)
     panel.set_xlabel(AXES[axis])
-    panel.set_ylabel("peak MB" if axis == "memory" else "ms")
+    panel.set_ylabel("MB" if axis in ("memory", "steps") else "ms")
     panel.set_title(curves[0].fixed, loc="left", fontsize=9, color=INK)
     return _save(figure, folder, f"growth-{axis}")
 

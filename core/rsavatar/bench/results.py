@@ -118,7 +118,7 @@ class Point(_Record):
 class Curve(_Record):
     """Growth along one axis with everything else fixed."""
 
-    axis: str  # gaussians, pixels (of a side), bands (T), memory (by T), frames
+    axis: str  # gaussians, pixels (of a side), bands (T), memory (by T), steps, frames
     name: str  # which way, how many threads
     fixed: str  # in words
     points: list[Point]

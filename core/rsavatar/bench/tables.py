@@ -110,7 +110,14 @@ def _curve(curve: Curve) -> TextTable:
     return TextTable(title, (AXES[curve.axis], *(MEASURES[key] for key in present)), rows)
 
 
-AXES = {"gaussians": "Gaussians", "pixels": "pixels of a side", "bands": "T", "memory": "T", "frames": "frames"}
+AXES = {
+    "gaussians": "Gaussians",
+    "pixels": "pixels of a side",
+    "bands": "T",
+    "memory": "T",
+    "steps": "training steps",
+    "frames": "frames",
+}
 
 
 def _value(point: Point, key: str) -> str:
