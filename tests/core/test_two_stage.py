@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from rsavatar import catalog
-from rsavatar.data.base import Image
+from rsavatar.data.base import Direction, Image
 from rsavatar.errors import DataError
 from rsavatar.events import Event, Progress, silent
 from rsavatar.methods.base import Case, Prepared, observations
 from rsavatar.methods.oblivious import ShutterObliviousAvatar
-from rsavatar.methods.two_stage import FlowThenAvatar, measure_gain, restored_subject
+from rsavatar.methods.two_stage import FlowThenAvatar, measure_gain, restored_subject, turned
 from rsavatar.restore.classical import FlowCorrector
 from tests.core import small_subject
 
@@ -76,6 +76,32 @@ def test_the_avatar_is_gauhumans_on_other_pictures(case: Case) -> None:
     assert [o.frame for o in seen] == [o.frame for o in plain]
     slots = [method.shutter(found).slots(40, 11.0, 2.0) for method in (FlowThenAvatar(), ShutterObliviousAvatar())]
     assert slots[0] == slots[1]
+
+
+@pytest.mark.parametrize("direction", ["down", "up", "left", "right"])
+def test_a_sensor_is_restored_in_the_direction_it_is_read(case: Case, direction: Direction) -> None:
+    """The same pictures turned: restored as the upright ones, and turned back."""
+
+    def observe(camera: str, frame: int) -> Image:
+        return turned(rolling(camera, frame), direction, back=True)
+
+    timing = replace(case.subject.timing, direction=direction)
+    found = restored_subject(replace(case.subject, observe=observe, timing=timing), FlowCorrector())
+    upright = restored_subject(case.subject, FlowCorrector())
+    for mine, other in zip(found.observe("01", 1), turned(upright.observe("01", 1), direction, back=True), strict=True):
+        np.testing.assert_array_equal(mine, other)
+    first = turned(rolling("00", 0), direction, back=True)[1]
+    rows = {"down": first[:1], "up": first[-1:], "right": first[:, :1].T, "left": first[:, -1:].T}[direction]
+    np.testing.assert_array_equal(rows, rolling("00", 0)[1][:1])
+
+
+def test_images_that_were_never_taken_are_left_out(case: Case) -> None:
+    missing = frozenset({("00", 1)})
+    found = prepared(replace(case, subject=replace(case.subject, missing=missing))).case.subject
+    np.testing.assert_array_equal(found.observe("00", 0)[0], rolling("00", 0)[0])  # no neighbour left
+    assert (found.observe("01", 1)[0] != rolling("01", 1)[0]).any()
+    with pytest.raises(DataError, match=r"000001\.png"):
+        found.observe("00", 1)
 
 
 def test_without_sharp_training_views_nothing_is_claimed(case: Case) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from rsavatar.body.cache import cache_dir
-from rsavatar.data.base import Image, Subject
+from rsavatar.data.base import Direction, Image, Subject
 from rsavatar.errors import DataError, expected
 from rsavatar.events import Note, Progress, Report, silent
 from rsavatar.methods.base import AbstractMethod, Case, Prepared
@@ -102,35 +102,50 @@ def restored_subject(
     folders: dict[str, Path] = {}
     for index, camera in enumerate(subject.training):
 
-        def read(frame: int, camera: str = camera) -> Image:
-            return subject.observe(camera, frame)
+        def read(frame: int, camera: str = camera) -> Image | None:
+            if (camera, frame) in subject.missing:
+                return None
+            return turned(subject.observe(camera, frame), subject.timing.direction)
 
         def each(frame: int, before: int = index * subject.frames) -> None:
             report(Progress("restore", before + frame + 1, total, time.monotonic() - begun))
 
         film = Film(read, subject.frames, gamma)
         folders[camera] = restored(film, corrector, cache_dir() / "restored", each, should_stop)
-    return replace(subject, observe=_reader(folders))
+    return replace(subject, observe=_reader(folders, subject.timing.direction))
 
 
-def _reader(folders: Mapping[str, Path]) -> Callable[[str, int], Image]:
+def turned(picture: Image, direction: Direction, back: bool = False) -> Image:
+    """The picture of a sensor that is read in ``direction`` as one that is read downwards; or ``back``."""
+    sideways, mirrored = direction in ("left", "right"), direction in ("up", "left")
+    first, second = picture
+    for step in ("mirror", "turn") if back else ("turn", "mirror"):
+        if step == "turn" and sideways:
+            first, second = first.swapaxes(0, 1), second.swapaxes(0, 1)
+        elif step == "mirror" and mirrored:
+            first, second = first[::-1], second[::-1]
+    return np.ascontiguousarray(first), np.ascontiguousarray(second)
+
+
+def _reader(folders: Mapping[str, Path], direction: Direction) -> Callable[[str, int], Image]:
     def read(camera: str, frame: int) -> Image:
         if camera not in folders:
             raise DataError(expected("restored camera", f"one of {sorted(folders)}", repr(camera)))
-        return read_restored(folders[camera], frame)
+        return turned(read_restored(folders[camera], frame), direction, back=True)
 
     return read
 
 
 def measure_gain(rolling: Subject, sharper: Subject) -> Gain | None:
     """What restoring gained; None where the sharp frames of the training cameras are not known."""
+    there = {c: [n for n in range(rolling.frames) if (c, n) not in rolling.missing] for c in rolling.training}
+    seen = {camera: frames for camera, frames in there.items() if frames}
     try:
-        rolling.truth(rolling.training[0], 0)
+        for camera, frames in seen.items():
+            rolling.truth(camera, frames[0])
     except DataError:
         return None
-    gains = [
-        np.mean([_gain(rolling, sharper, camera, n) for n in range(rolling.frames)], 0) for camera in rolling.training
-    ]
+    gains = [np.mean([_gain(rolling, sharper, camera, n) for n in frames], 0) for camera, frames in seen.items()]
     body, full = np.mean(gains, 0)
     return Gain(float(body), float(full))
 

@@ -22,9 +22,9 @@ FORMAT = 1  # raise it when what is kept changes: it is part of the key
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """The frames of one camera, in time. ``read`` may decode: every frame is asked for a few times."""
+    """The frames of one camera, in time. ``read`` may decode: every frame is asked for twice; None was never taken."""
 
-    read: Callable[[int], Picture]
+    read: Callable[[int], Picture | None]
     frames: int
     gamma: float  # readout as a part of the frame period
 
@@ -39,7 +39,7 @@ def restored(
     """Folder of the restored frames of ``film`` under ``root``, made if it is not there; read by ``read_restored``.
 
     Args:
-        film: what to restore; at least two frames.
+        film: what to restore; at least two frames. A frame whose neighbours were never taken stays as it is.
         corrector: how.
         root: the cache.
         each: hears of every frame that is restored.
@@ -70,7 +70,7 @@ def key(film: Film, corrector: AbstractCorrector) -> str:
     """sha256 over the pictures, the readout and what corrects them."""
     digest = hashlib.sha256(f"{FORMAT}\0{corrector.identity}\0{film.gamma!r}\0{film.frames}".encode())
     for n in range(film.frames):
-        for part in film.read(n):
+        for part in film.read(n) or ():
             digest.update(str(part.shape).encode())
             digest.update(np.ascontiguousarray(part).tobytes())
     return digest.hexdigest()
@@ -102,13 +102,17 @@ def _restore(
         if should_stop():
             raise Interrupted(f"stopped while restoring frame {n}")
         before, frame, after = window
-        assert frame is not None
-        rgb, coverage = corrector.restore(Shot(before, frame, after, film.gamma))
-        path = folder / f"{n:06d}.png"
-        if not cv2.imwrite(str(path), np.dstack([rgb[..., ::-1], coverage])):
-            raise DataError(expected(str(path), "room for a picture", "a failed write"))
+        if frame is not None:
+            alone = before is None and after is None
+            _write(folder, n, frame if alone else corrector.restore(Shot(before, frame, after, film.gamma)))
         window = [frame, after, film.read(n + 2) if n + 2 < film.frames else None]
         each(n)
+
+
+def _write(folder: Path, frame: int, picture: Picture) -> None:
+    path = folder / f"{frame:06d}.png"
+    if not cv2.imwrite(str(path), np.dstack([picture[0][..., ::-1], picture[1]])):
+        raise DataError(expected(str(path), "room for a picture", "a failed write"))
 
 
 @contextmanager
