@@ -20,6 +20,7 @@ from sqlalchemy.sql.functions import FunctionElement
 from services.errors import SettingsError
 from services.settings import Settings
 from services.store.blobs import open_blobs
+from services.store.turn import Turn
 
 OUTAGES = (OperationalError, InterfaceError, PoolTimeoutError)  # of a database that may come back
 CONNECT_SECONDS = 5
@@ -65,6 +66,7 @@ class Store:
         self.artifacts_dir: Path = self.blobs.root
         self.quota = Quota(settings.max_queued_per_owner, settings.max_running_per_owner)
         self._writer = self.engine.execution_options(immediate=True)
+        self._turn = Turn(_queue_of(self.engine))
 
     @contextmanager
     def read(self) -> Iterator[Session]:
@@ -75,7 +77,7 @@ class Store:
     @contextmanager
     def write(self) -> Iterator[Session]:
         """A session that commits when the block ends, and rolls back when it raises."""
-        with Session(self._writer) as session, session.begin():
+        with self._turn.take(), Session(self._writer) as session, session.begin():
             yield session
 
     def now(self) -> float:
@@ -86,6 +88,13 @@ class Store:
     def close(self) -> None:
         """Give all connections back."""
         self.engine.dispose()
+        self._turn.close()
+
+
+def _queue_of(engine: Engine) -> Path | None:
+    """The file that writers of an SQLite file queue at; none for other databases."""
+    file = engine.url.database
+    return Path(f"{file}-turn") if engine.dialect.name == "sqlite" and file not in (None, "", ":memory:") else None
 
 
 def open_engine(url: str) -> Engine:
