@@ -53,7 +53,8 @@ def bench(arguments: argparse.Namespace) -> int:
         if error.name not in {"rsavatar.bench", place}:
             raise
         raise SpecError(f"bench {arguments.name}: not available in this version") from None
-    more = (arguments.subjects, arguments.preset) if arguments.name == "train" else ()
+    given = {"train": (arguments.subjects, arguments.preset), "builder": (arguments.subjects,)}
+    more = given.get(arguments.name, ())
     return int(module.main(arguments.json, *more) or 0)
 
 

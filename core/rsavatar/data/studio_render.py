@@ -19,6 +19,8 @@ Indices = npt.NDArray[np.int64]
 Bytes = npt.NDArray[np.uint8]
 Paint = Callable[[Indices, Array], Array]  # triangles [M] and barycentric weights [M, 3] -> RGB [M, 3] in 0..1
 
+SAMPLES = 3  # per axis and pixel
+
 
 @dataclass(frozen=True)
 class Strip:
@@ -38,7 +40,9 @@ class _Scans:
     corners: Array  # [L, 3, 3]: x and y in samples, 1 / depth
 
 
-def draw(strips: list[Strip], faces: Indices, camera: Camera, paint: Paint, samples: int = 3) -> tuple[Bytes, Bytes]:
+def draw(
+    strips: list[Strip], faces: Indices, camera: Camera, paint: Paint, samples: int = SAMPLES
+) -> tuple[Bytes, Bytes]:
     """One picture of a surface that faces outward (counter-clockwise from outside); the back is not drawn.
 
     Visibility is exact at every sample: the nearest triangle by perspective-correct depth. Colours are averaged as

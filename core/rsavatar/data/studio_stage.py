@@ -11,7 +11,7 @@ from rsavatar.body.base import BodyModel
 from rsavatar.data.base import Array, BodyFit, Bytes, Image
 from rsavatar.data.studio_motion import Motion, bones, choose_motion, pose_meshes, skinning_table
 from rsavatar.data.studio_paint import WARDROBES, drawn_wardrobe, painter
-from rsavatar.data.studio_render import Paint, Strip, draw
+from rsavatar.data.studio_render import SAMPLES, Paint, Strip, draw
 from rsavatar.geometry.cameras import Camera
 
 TRAINING, HELD_OUT = (0, 2, 4, 6), (1, 3, 5, 7)
@@ -32,13 +32,13 @@ class Stage:
         """RGB and coverage of a picture whose row v is exposed at ``times[v]``, in source frames."""
         return self.pictures([camera], times)[0]
 
-    def pictures(self, cameras: list[Camera], times: Array) -> list[Image]:
+    def pictures(self, cameras: list[Camera], times: Array, samples: int = SAMPLES) -> list[Image]:
         """The same for several cameras with one clock; each distinct time is posed once."""
         starts = np.flatnonzero(np.concatenate([[True], np.diff(times) != 0]))
         ends = np.append(starts[1:], len(times))
         meshes = pose_meshes(self.table, bones(self.body, self.motion.at(times[starts]))[0])
         strips = [Strip(int(lo), int(hi), mesh) for lo, hi, mesh in zip(starts, ends, meshes, strict=True)]
-        return [draw(strips, self.body.faces, camera, self.paint) for camera in cameras]
+        return [draw(strips, self.body.faces, camera, self.paint, samples) for camera in cameras]
 
     def exposed(self, cameras: list[Camera], times: Array, exposure: float) -> list[Image]:
         """The mean of pictures over an ``exposure`` in source frames that is centred on every row's time."""
