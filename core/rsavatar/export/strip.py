@@ -119,11 +119,16 @@ def around(mask: Bytes) -> tuple[int, int, int, int]:
 
 
 def busiest(values: Floats) -> Sequence[int]:
-    """The square (x0, y0, x1, y1) with the greatest mean."""
+    """The square (x0, y0, x1, y1) with the greatest mean, moved so that what it holds lies in its middle."""
     height, width = values.shape
     side = max(8, min(round(ZOOMED * (height + width) / 2 * 1.25), height, width))
     means = cv2.boxFilter(values, -1, (side, side), anchor=(0, 0), borderType=cv2.BORDER_CONSTANT)
-    y, x = np.unravel_index(
-        int(means[: height - side + 1, : width - side + 1].argmax()), (height - side + 1, width - side + 1)
-    )
-    return [int(x), int(y), int(x) + side, int(y) + side]
+    whole = means[: height - side + 1, : width - side + 1]
+    y, x = (int(place) for place in np.unravel_index(int(whole.argmax()), whole.shape))
+    held = np.clip(values[y : y + side, x : x + side], 0, None)
+    if held.sum() > 0:
+        down, right = np.indices(held.shape)
+        y = round(y + float((down * held).sum() / held.sum()) - side / 2)
+        x = round(x + float((right * held).sum() / held.sum()) - side / 2)
+    x, y = min(max(x, 0), width - side), min(max(y, 0), height - side)
+    return [x, y, x + side, y + side]

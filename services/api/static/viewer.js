@@ -6,7 +6,7 @@ const page = document.querySelector("[data-viewer]"), api = page.dataset.viewer;
 const at = (id) => document.getElementById(id);
 const canvas = at("stage"), form = at("controls");
 const SLIDERS = ["time", "readout", "azimuth", "elevation", "zoom"];
-const FRAMES_A_SECOND = 6, TURN = 5, STEP = 0.1, SHARPEST = 1200, BLUR_INSTANTS = 10;
+const FRAMES_A_SECOND = 6, TURN = 5, STEP = 0.1, SHARPEST = 1200, BLUR_INSTANTS = 10, RETRIES = 4, PAUSE = 1500;
 let scene = null, view = null, playing = false, waiting = 0, last = 0, settled = 0;
 
 const value = (id) => Number(at(id).value);
@@ -118,9 +118,17 @@ function ask(each, url) {
     else each.image.classList.remove("stale");
   };
   const fresh = new Image();
-  fresh.onload = () => { each.image.src = each.shown = url; done(); };
-  fresh.onerror = done;
+  fresh.onload = () => { each.image.src = each.shown = url; each.failed = 0; at("trouble").hidden = true; done(); };
+  fresh.onerror = () => { each.failed = (each.failed ?? 0) + 1; done(); trouble(each, url); };
   fresh.src = url;
+}
+
+async function trouble(each, url) { // tell why, and try again a few times: the process that draws may be starting
+  if (each.failed <= RETRIES) setTimeout(settle, PAUSE * each.failed);
+  const reply = await fetch(url).catch(() => null);
+  if (reply?.ok) return;
+  at("trouble").hidden = false;
+  at("trouble").textContent = reply ? `The service cannot draw this: ${(await reply.json()).detail}` : "The service does not answer.";
 }
 
 function settle() { // what is dear or read aloud waits until the hand rests
