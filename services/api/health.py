@@ -14,7 +14,7 @@ from services import jobs as wake_up
 from services.api.access import READ
 from services.api.deps import Back, Backend
 from services.errors import SchemaError
-from services.store import jobs, schema
+from services.store import garbage, jobs, schema
 
 LEAST_FREE_BYTES = 256 << 20
 
@@ -66,6 +66,16 @@ def prometheus(request: Request, back: Back) -> PlainTextResponse:
         "# HELP rsavatar_oldest_wait_seconds Age of the oldest job that could run and does not.",
         "# TYPE rsavatar_oldest_wait_seconds gauge",
         f"rsavatar_oldest_wait_seconds {jobs.oldest_wait(back.store):.3f}",
+    ]
+    stored = garbage.totals(back.store)
+    lines += [
+        "# HELP rsavatar_stored_bytes Bytes under their hashes; named: by an artifact or a checkpoint.",
+        "# TYPE rsavatar_stored_bytes gauge",
+        f'rsavatar_stored_bytes{{named="yes"}} {stored.bytes - stored.garbage_bytes}',
+        f'rsavatar_stored_bytes{{named="no"}} {stored.garbage_bytes}',
+        "# HELP rsavatar_stored_blobs Files under their hashes.",
+        "# TYPE rsavatar_stored_blobs gauge",
+        f"rsavatar_stored_blobs {stored.blobs}",
     ]
     measured = generate_latest(request.app.state.registry).decode()
     return PlainTextResponse("\n".join(lines) + "\n" + measured, media_type="text/plain; version=0.0.4; charset=utf-8")

@@ -15,6 +15,7 @@ from starlette.exceptions import HTTPException
 
 from rsavatar.errors import SpecError
 from services.errors import ConflictError, ForbiddenError, NotFoundError, QuotaError, RequestError, ServiceError
+from services.store.session import OUTAGES
 
 MEDIA_TYPE = "application/problem+json"
 LONGEST_ECHO = 200  # characters of a refused value that are sent back
@@ -91,6 +92,12 @@ async def _http(request: Request, error: Exception) -> Response:
     return problem(error.status_code, str(error.detail), headers=error.headers)
 
 
+async def _outage(request: Request, error: Exception) -> Response:
+    log.warning("%s %s: the database is away: %s", request.method, request.url.path, str(error).partition("\n")[0])
+    detail = "the database does not answer; nothing is lost, try again in a moment"
+    return problem(503, detail, headers={"retry-after": "2"})
+
+
 async def _unexpected(request: Request, error: Exception) -> Response:
     log.error("%s %s", request.method, request.url.path, exc_info=error)
     return problem(500, "an error of the service; its log has the details")
@@ -101,6 +108,7 @@ HANDLERS: dict[type[Exception], Callable[[Request, Exception], Awaitable[Respons
     SpecError: _spec,
     RequestValidationError: _validation,
     HTTPException: _http,
+    **dict.fromkeys(OUTAGES, _outage),
     Exception: _unexpected,
 }
 

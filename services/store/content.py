@@ -10,8 +10,8 @@ import hashlib
 import os
 import threading
 import time
-from collections.abc import Iterable, Iterator
-from functools import cache
+from collections.abc import Callable, Iterable, Iterator
+from functools import cache, lru_cache
 from pathlib import Path
 
 import rsavatar
@@ -27,7 +27,7 @@ BODY_FILES = ("body*.npz", "SMPL_NEUTRAL.*", "body/body*.npz", "body/SMPL_NEUTRA
 BUILT_IN = "made by the code"  # data of a subject without a folder: the code's hash says it all
 
 _lock = threading.Lock()
-_seen: dict[tuple[str, str], tuple[float, str]] = {}  # (database, subject's folder) -> when looked at, data's hash
+_seen: dict[str, tuple[float, str]] = {}  # what was looked at -> when, and its hash
 
 
 def content_sha256(store: Store, spec: JobSpec, subject: Subject) -> str:
@@ -51,12 +51,17 @@ def data_sha256(store: Store, subject: Subject) -> str:
     """
     if subject.path is None:
         return BUILT_IN
-    key = (str(store.engine.url), subject.path)
+    path = Path(subject.path)
+    return _lately(f"{store.engine.url} {path}", lambda: _kept(store, subject.name, path))
+
+
+def _lately(key: str, look: Callable[[], str]) -> str:
+    """What ``look`` has found in the last ``FRESH_SECONDS``, or finds now."""
     with _lock:
         looked, known = _seen.get(key, (0.0, ""))
     if known and time.monotonic() - looked < FRESH_SECONDS:
         return known
-    known = _kept(store, subject.name, Path(subject.path))
+    known = look()
     with _lock:
         _seen[key] = time.monotonic(), known
     return known
@@ -131,11 +136,19 @@ def _file_sha256(path: Path, size: int, changed: int) -> str:
     return bytes_sha256(path.parent, [path])
 
 
-@cache
 def code_sha256() -> str:
-    """Hash of the core as this process has loaded it: its sources, and those of the kernels (else their libraries)."""
+    """Hash of the core as the next job will load it: its sources, and those of the kernels (else their libraries)."""
+    return _lately("code", _look_at_code)
+
+
+def _look_at_code() -> str:
     package = Path(rsavatar.__file__).parent
     native = package.parent / "native"
     files = sorted(package.rglob("*.py"))
-    kernels = sorted(native.glob("*.[ch]*")) if native.is_dir() else sorted(package.rglob("*.so"))
-    return bytes_sha256(package.parent, [*files, *kernels])
+    files += sorted(native.glob("*.[ch]*")) if native.is_dir() else sorted(package.rglob("*.so"))
+    return _code_sha256(package.parent, tuple(files), stat_sha256(package.parent, files))
+
+
+@lru_cache(maxsize=4)
+def _code_sha256(root: Path, files: tuple[Path, ...], stat: str) -> str:
+    return bytes_sha256(root, files)

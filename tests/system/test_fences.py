@@ -85,6 +85,8 @@ def test_postgresql_is_killed_while_a_job_runs(pair: Host, server: postgresql.Se
     job = pair.submit(iterations=400)
     pair.wait_for_step(job, 20)
     server.kill()
+    refused = pair.client.get("/api/v1/jobs")
+    assert (refused.status_code, refused.headers["retry-after"]) == (503, "2")
     server.start()
     view = pair.wait_for(job, "succeeded")
     assert (view["attempt"], view["failures"]) == (1, 0)  # the child has trained on meanwhile

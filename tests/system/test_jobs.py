@@ -24,6 +24,20 @@ def test_a_job_from_submission_to_table(host: Host) -> None:
     assert host.children() == []
 
 
+def test_the_same_job_again_ends_at_once_with_the_known_result(host: Host) -> None:
+    spec = {"method": "gauhuman", "subject": "studio", "preset": "smoke", "iterations": 37}
+    first = host.client.post("/api/v1/jobs", json=spec).json()["id"]
+    beside = host.client.post("/api/v1/jobs", json={**spec, "priority": 3}).json()["id"]
+    assert host.wait_for(first, "succeeded")["attempt"] + host.wait_for(beside, "succeeded")["attempt"] == 1
+    again = host.client.post("/api/v1/jobs", json=spec)
+    assert (again.status_code, again.json()["state"], again.json()["attempt"]) == (200, "succeeded", 0)
+    results = [host.client.get(f"/api/v1/jobs/{job}/results").json() for job in (first, beside, again.json()["id"])]
+    assert results[0]["means"] == results[1]["means"] == results[2]["means"]
+    forced = host.client.post("/api/v1/jobs", params={"force": True}, json=spec)
+    assert (forced.status_code, forced.json()["reused_from"]) == (202, None)
+    assert host.wait_for(forced.json()["id"], "succeeded")["attempt"] == 1
+
+
 def test_duplicate_deliveries_change_nothing(host: Host) -> None:
     job = host.submit(iterations=30)
     app = wake_up.make_app(host.settings)
