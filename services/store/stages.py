@@ -1,8 +1,8 @@
 """Work that many jobs share (a built subject, restored frames): one process builds it, the others wait for it.
 
 The protocol is that of jobs: a claim by compare-and-set raises ``attempt``, the fence; the lease is on the database's
-clock; a builder that falls silent loses the stage to the next who asks. ``rsavatar.shared`` makes the same promise with
-a folder and a lock where there is no service.
+clock; a builder that falls silent loses the stage to the next who asks. On one disk the core needs none of it: its
+caches (``rsavatar.restore.cache``, ``rsavatar.data.build``) are content-addressed folders with a lock.
 """
 
 from __future__ import annotations
