@@ -128,7 +128,7 @@ class JobSpec(BaseModel):
     densify: bool = Field(True, description="adaptive density control: clone, split, prune")
     checkpoint_every: int = Field(1000, ge=1, description="steps between checkpoints")
 
-    blur_triggers: bool = Field(False, description="mad-avatar is told the triggers, which its formula has no place for")
+    blur_triggers: bool = Field(False, description="mad-avatar is told the triggers, which its formula lacks")
     skip: tuple[Skip, ...] = Field(SKIPS, description="work left out where the scene does not need it")
     calibrate: tuple[Unknown, ...] = Field((), description="what of the schedule is learned: readout, trigger")
     exposure_frames: float | None = Field(

@@ -15,7 +15,7 @@ from rsavatar.bench.scene import READOUT, Size, build
 from rsavatar.bench.stability_case import FIELDS, Case, Measured, against_twin, outcome, stays_physical
 from rsavatar.render import native
 from rsavatar.render.base import Gaussians, Options, Scene
-from rsavatar.shutter.base import AbstractShutter
+from rsavatar.shutter.base import AbstractShutter, Slot, upwards
 from rsavatar.shutter.rolling import Bands, Blur, Instant, Scanline
 
 Change = Callable[[Scene], Scene]
@@ -137,6 +137,17 @@ def _needle_cases() -> list[Case]:
     return [Case(f"needles 1e{p}:1, {n}", AS_TWIN, of(10.0**p, s)) for p in (2, 3, 4) for n, s in SHUTTERS.items()]
 
 
+class _Upwards(AbstractShutter):
+    """Another shutter on a sensor that is read from its last row."""
+
+    def __init__(self, inner: AbstractShutter) -> None:
+        self._inner = inner
+
+    def slots(self, height: int, readout: float, trigger: float) -> tuple[Slot, ...]:
+        """The inner shutter's, reversed."""
+        return upwards(self._inner.slots(height, readout, trigger), height)
+
+
 def _shutter_cases() -> list[Case]:
     kinds: dict[str, tuple[AbstractShutter, float]] = {
         "T = 1": (Bands(1), READOUT),
@@ -146,7 +157,7 @@ def _shutter_cases() -> list[Case]:
         "readout 0, scanline": (Scanline(), 0.0),
         "readout 0, bands": (Bands(4), 0.0),
         "readout 1e-9, scanline": (Scanline(), 1e-9),
-        "bottom-up with exposure": (Scanline(0.2, 3, "up"), READOUT),
+        "bottom-up with exposure": (_Upwards(Scanline(0.2, 3)), READOUT),
     }
     shapes = {"one pixel": (1, 1), "one row": (1, 96), "one column": (96, 1), "17 x 31": (17, 31)}
 
