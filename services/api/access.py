@@ -23,7 +23,7 @@ from services.errors import ForbiddenError
 from services.store.tables import LOCAL
 from services.store.tokens import Scope, covered
 
-PUBLIC = frozenset({"/healthz", "/readyz", "/login"})
+PUBLIC = frozenset({"/healthz", "/readyz", "/login", "/palette.css"})
 PUBLIC_FOLDER = "/static/"  # styles and scripts, which the login page needs
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 FORM = "application/x-www-form-urlencoded"
@@ -99,8 +99,10 @@ class Needs:
             HTTPException: 401 if nobody has been let in.
             ForbiddenError: if the scope, or the proof that a form is ours, is missing.
         """
-        caller = caller_of(request)
         is_safe = request.method in SAFE_METHODS
+        if is_safe and is_public(request.url.path):
+            return
+        caller = caller_of(request)
         wanted = self.looking if is_safe else self.changing
         if not caller.may(wanted):
             raise ForbiddenError("token", f"scope {wanted}", ", ".join(sorted(caller.scopes)) or "none")

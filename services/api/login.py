@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from urllib.parse import urlsplit
 
 import anyio
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
-from fastapi.templating import Jinja2Templates
 
 from services.api.access import READ, Who, read_form
 from services.api.deps import Back
 from services.api.gate import COOKIE
+from services.api.layout import page
 from services.store import tokens
 
 HOUR = 3600
 
 router = APIRouter(include_in_schema=False)
-templates = Jinja2Templates(Path(__file__).parent / "templates")
 
 
 def safe_next(target: str) -> str:
@@ -31,8 +29,13 @@ def safe_next(target: str) -> str:
 @router.get("/login", response_class=HTMLResponse)
 def show_login(request: Request) -> HTMLResponse:
     """The page that asks for a token."""
-    context = {"next": safe_next(request.query_params.get("next", "/")), "wrong": False}
-    return templates.TemplateResponse(request, "login.html", context)
+    return ask(request, safe_next(request.query_params.get("next", "/")))
+
+
+def ask(request: Request, target: str, *, wrong: bool = False) -> HTMLResponse:
+    """The form, again where the token was wrong. It leads nowhere else before somebody is let in."""
+    context = {"next": target, "wrong": wrong, "nav": None}
+    return page(request, "login.html", context, status=401 if wrong else 200)
 
 
 @router.post("/login", response_class=HTMLResponse)
@@ -42,8 +45,7 @@ async def log_in(request: Request, back: Back) -> Response:
     target, secret = safe_next(form.get("next", "/")), form.get("token", "").strip()
     token = await anyio.to_thread.run_sync(tokens.find, back.store, secret)
     if token is None or token.name.startswith(tokens.SESSION):
-        context = {"next": target, "wrong": True}
-        return templates.TemplateResponse(request, "login.html", context, status_code=401)
+        return ask(request, target, wrong=True)
     seconds = back.settings.session_hours * HOUR
     _, session = await anyio.to_thread.run_sync(tokens.open_session, back.store, token, seconds)
     reply = RedirectResponse(target, 303)

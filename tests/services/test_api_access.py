@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import httpx
@@ -35,7 +36,7 @@ def test_every_route_has_a_scope_or_is_public(settings: Settings, store: Store) 
     app = create_app(settings)
     assert list(unguarded(app)) == []
     assert len(routes_of(app)) > 30
-    assert {"/healthz", "/readyz", "/login"} == PUBLIC
+    assert {"/healthz", "/readyz", "/login", "/palette.css"} == PUBLIC
 
 
 def test_an_application_with_a_forgotten_route_does_not_start(settings: Settings, store: Store) -> None:
@@ -145,7 +146,11 @@ def log_in(client: httpx.Client, store: Store, *scopes: str) -> str:
 def test_a_browser_is_sent_to_the_login_and_back(closed: httpx.Client, store: Store) -> None:
     page = closed.get("/jobs", headers={"accept": "text/html"})
     assert (page.status_code, page.headers["location"]) == (303, "/login?next=/jobs")
-    assert 'name="token"' in closed.get(page.headers["location"]).text
+    form = closed.get(page.headers["location"]).text
+    assert 'name="token"' in form
+    assert "<nav" not in form
+    for path in re.findall(r'(?:href|src)="(/[^"]+\.(?:css|js|svg))"', form):
+        assert closed.get(path).status_code == 200, "what the login page needs comes without a token"
     assert closed.post("/login", data={"token": "rsa_no"}).status_code == 401
     session = log_in(closed, store, "read")
     assert closed.get("/api/v1/jobs").status_code == 200
