@@ -10,7 +10,7 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse
 
-from rsavatar.report.tables import render
+from rsavatar.report.tables import PAPER_MAIN, render
 from rsavatar.spec import Preset
 from services.api import findings
 from services.api.deps import Back, Backend
@@ -84,6 +84,7 @@ def index(request: Request, back: Back, preset: Preset | None = None) -> HTMLRes
         "preset": chosen,
         "presets": presets,
         "finding": found,
+        "paper_gain": PAPER_MAIN[findings.OURS]["psnr"] - PAPER_MAIN[findings.BASELINE]["psnr"],
         "pair": _pair(back, found),
         "table": to_grid(render("main", [to_row(e) for e in entries if e.job.spec.get("preset") == chosen], "md")),
         "looked_at": LOOKED_AT if counts[State.SUCCEEDED] > LOOKED_AT else None,

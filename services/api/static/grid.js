@@ -24,14 +24,14 @@ function parallel() {
   const done = data.jobs.filter((job) => job.metrics[metric()] !== null);
   if (!done.length || all.length < 2) { place.textContent = "The lines appear with the first results."; place.className = "parallel quiet"; return; }
   place.className = "parallel";
-  const width = Math.max(place.clientWidth, 320), height = 340, left = 70, right = 70, top = 40, bottom = 20;
+  const width = Math.max(place.clientWidth, 150 * all.length), height = 340, left = 70, right = 70, top = 40, bottom = 20;
   const x = (i) => left + (i * (width - left - right)) / (all.length - 1);
   const y = (axis, job) => {
     const value = axis.of(job);
     const part = axis.values ? (axis.values.length > 1 ? axis.values.indexOf(value) / (axis.values.length - 1) : 0.5) : (axis.high > axis.low ? (value - axis.low) / (axis.high - axis.low) : 0.5);
     return axis.values || axis.less ? top + part * (height - top - bottom) : height - bottom - part * (height - top - bottom);
   };
-  const svg = node("svg", { viewBox: `0 0 ${width} ${height}`, height, role: "img", "aria-label": `Parallel coordinates of ${done.length} jobs over ${all.map((a) => a.name).join(", ")}` });
+  const svg = node("svg", { viewBox: `0 0 ${width} ${height}`, width, height, role: "img", "aria-label": `Parallel coordinates of ${done.length} jobs over ${all.map((a) => a.name).join(", ")}` });
   for (const job of done) {
     const path = node("path", { class: slug(job.method), d: line(all.map((axis, i) => [x(i), y(axis, job)])) });
     path.classList.toggle("off", [...chosen].some(([name, value]) => job.words[name] !== value));

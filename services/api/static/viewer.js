@@ -211,7 +211,8 @@ at("turn").addEventListener("click", () => {
   button.disabled = true;
   button.textContent = "Rendering …";
   video.src = `${api}/export/turntable?format=mp4`;
-  video.onloadeddata = () => { video.hidden = false; button.hidden = true; if (!matchMedia("(prefers-reduced-motion: reduce)").matches) video.play(); };
+  video.preload = "auto"; // hidden, it would wait to be asked
+  video.onloadedmetadata = () => { video.hidden = false; button.hidden = true; if (!matchMedia("(prefers-reduced-motion: reduce)").matches) video.play(); };
   video.onerror = () => { button.disabled = false; button.textContent = "It could not be made; try again"; };
 });
 document.documentElement.classList.add("scripted");
