@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
-from sqlalchemy import func, insert, select
+from sqlalchemy import Table, func, insert, select
 from sqlalchemy.orm import Session
 
 from services.store.records import Event
@@ -12,13 +13,13 @@ from services.store.session import Store, db_now
 from services.store.tables import EventRow
 
 PAGE = 500
+APPEND = insert(cast(Table, EventRow.__table__)).values(created_at=db_now())  # built once: every heartbeat says it
 
 
 def append(session: Session, job_id: str, events: Sequence[Event]) -> None:
     """Add ``events`` to a job inside the caller's transaction."""
-    for event in events:
-        values = {"job_id": job_id, "kind": event.kind, "payload": dict(event.payload), "created_at": db_now()}
-        session.execute(insert(EventRow).values(values))
+    if events:
+        session.execute(APPEND, [{"job_id": job_id, "kind": e.kind, "payload": dict(e.payload)} for e in events])
 
 
 def state_event(state: str, **details: object) -> Event:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
-from typing import Any
+from typing import Any, cast
 
-from sqlalchemy import insert, select
+from sqlalchemy import Table, insert, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
@@ -19,7 +19,7 @@ from services.store import events, owners, reuse
 from services.store.ids import new_id
 from services.store.records import Job, State, Submission
 from services.store.session import Store, db_now
-from services.store.tables import EventRow, JobRow
+from services.store.tables import JobRow
 
 FIELDS = tuple(f.name for f in fields(Job))
 FRESH: Mapping[str, Any] = {
@@ -30,6 +30,7 @@ FRESH: Mapping[str, Any] = {
     "step": 0,
     "steps": 0,
 }
+INSERT = insert(cast(Table, JobRow.__table__))  # built once
 ABSENT: Mapping[str, Any] = dict.fromkeys(FIELDS)
 
 Accepted = tuple[Job, bool]
@@ -112,11 +113,10 @@ def add(session: Session, rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Insert jobs with their first events; returns the ids of those whose result is known: they have ended with it."""
     if not rows:
         return []
-    session.execute(insert(JobRow), list(rows))
+    session.execute(INSERT, list(rows))
     told = events.state_event(State.QUEUED)
     about = {"kind": told.kind, "payload": dict(told.payload)}
-    news = [{"job_id": row["id"], "created_at": row["created_at"], **about} for row in rows]
-    session.execute(insert(EventRow), news)
+    session.execute(events.APPEND, [{"job_id": row["id"], **about} for row in rows])
     return reuse.adopt_all(session, _with_known_result(session, rows))
 
 

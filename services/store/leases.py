@@ -16,6 +16,7 @@ from sqlalchemy.orm import Session
 
 from services.errors import FencedError
 from services.store import artifacts, checkpoints, events, metrics, owners, reuse
+from services.store.heartbeat import renewal
 from services.store.records import Batch, Claim, Event, Failure, Look, Orders, Outcome, State
 from services.store.session import Store, db_now
 from services.store.tables import JobRow, SchedulerRow
@@ -79,11 +80,11 @@ def beat(store: Store, claim: Claim, batch: Batch, lease_seconds: float) -> Orde
     Raises:
         FencedError: if the job was given away; nothing of ``batch`` is stored.
     """
-    values: dict[str, Any] = {"lease_until": db_now() + lease_seconds, **_columns(batch.look)}
-    if batch.rss_bytes is not None:
-        values["rss_bytes"] = batch.rss_bytes
+    values = _columns(batch.look) | ({} if batch.rss_bytes is None else {"rss_bytes": batch.rss_bytes})
+    who = {"of_job": claim.job_id, "of_attempt": claim.attempt, "for_seconds": lease_seconds}
+    said = {f"new_{name}": value for name, value in values.items()}
     with store.write() as session:
-        asked = _fenced(session, claim, values)
+        asked = _orders(session.execute(renewal(tuple(values)), who | said).one_or_none(), claim)
         events.append(session, claim.job_id, batch.events)
         metrics.put_points(session, claim.job_id, batch.points)
         artifacts.put(session, claim.job_id, batch.artifacts)
@@ -104,7 +105,10 @@ def _fenced(session: Session, claim: Claim, values: Mapping[str, Any]) -> Orders
     mine = (JobRow.id == claim.job_id) & (JobRow.attempt == claim.attempt) & (JobRow.state == State.RUNNING)
     orders = (JobRow.cancel_requested_at, JobRow.pause_requested_at)
     change = update(JobRow).where(mine).values(**values).returning(*orders)
-    row = session.execute(change, execution_options=UNSEEN).one_or_none()
+    return _orders(session.execute(change, execution_options=UNSEEN).one_or_none(), claim)
+
+
+def _orders(row: Any, claim: Claim) -> Orders:
     if row is None:
         raise FencedError("attempt", f"the running attempt of job {claim.job_id}", claim.attempt)
     return Orders(row[0] is not None, row[1] is not None)

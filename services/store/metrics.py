@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
-from sqlalchemy import func, insert, select
+from sqlalchemy import Executable, func, insert, select
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
@@ -25,11 +26,17 @@ def put_points(session: Session, job_id: str, points: Sequence[Point]) -> None:
     if not points:
         return
     rows = [{"job_id": job_id, "key": p.key, "step": p.step, "value": p.value} for p in points]
-    dialect: Any = postgresql if session.get_bind().dialect.name == "postgresql" else sqlite
-    statement = dialect.insert(PointRow)
-    key = [PointRow.job_id, PointRow.key, PointRow.step]
-    replace = statement.on_conflict_do_update(index_elements=key, set_={"value": statement.excluded.value})
-    session.execute(replace, rows)
+    session.execute(_replace_points(session.get_bind().dialect.name), rows)
+
+
+@cache
+def _replace_points(name: str) -> Executable:
+    """Built once: every heartbeat says it."""
+    dialect: Any = postgresql if name == "postgresql" else sqlite
+    statement = dialect.insert(PointRow.__table__)
+    key = ["job_id", "key", "step"]
+    replace: Executable = statement.on_conflict_do_update(index_elements=key, set_={"value": statement.excluded.value})
+    return replace
 
 
 def put_outcome(session: Session, claim: Claim, outcome: Outcome) -> None:

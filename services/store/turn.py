@@ -1,4 +1,4 @@
-"""Whose turn it is to write into an SQLite file: the threads of a process queue up, and one of each process looks often.
+"""Whose turn it is to write into an SQLite file: the threads of a process queue up, one of each process looks often.
 
 SQLite's own waiting sleeps longer and longer, so that under load a writer often sleeps through its turn. Its lock is
 still taken (BEGIN IMMEDIATE): it decides, also against programs that do not queue here, and after ``PATIENCE_SECONDS``
