@@ -8,6 +8,7 @@ import json
 import os
 import secrets
 import threading
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -68,7 +69,7 @@ class DrawingCache:
         """The file of a key, marked as used; None where there is none."""
         path = self._folder / key
         with contextlib.suppress(OSError):
-            os.utime(path)
+            os.utime(path, (time.time(), path.stat().st_mtime))  # Last-Modified must not move under a player
             return path
         return None
 
@@ -91,7 +92,7 @@ class DrawingCache:
         for entry in os.scandir(self._folder):
             with contextlib.suppress(OSError):
                 about = entry.stat()
-                found.append((about.st_mtime, about.st_size, Path(entry.path)))
+                found.append((about.st_atime, about.st_size, Path(entry.path)))
         total = sum(size for _, size, _ in found)
         if total <= self._limit:
             return

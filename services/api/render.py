@@ -16,6 +16,7 @@ LARGEST, LARGEST_VIDEO = 1024, 768  # pixels of the longer side
 VIDEOS = {"mp4": "video/mp4", "webm": "video/webm", "gif": "image/gif"}
 IMAGES = {"png": "image/png", "webp": "image/webp"}
 BYTES = "application/octet-stream"
+ALONE = "default-src 'none'; media-src 'self'; img-src 'self'"  # a video that is opened by itself may play
 
 router = APIRouter(prefix="/jobs/{job_id}", tags=["views"])
 Tag = Annotated[str | None, Header()]
@@ -93,5 +94,5 @@ def get_export(
         order, mime = {"verb": "turntable", "source": source, "view": view, **about}, VIDEOS[query.format]
         name = f"{stem}-turntable.{query.format}"
     how = "attachment" if kind == "ply" else "inline"
-    headers = {"content-disposition": f'{how}; filename="{name}"'}
+    headers = {"content-disposition": f'{how}; filename="{name}"', "content-security-policy": ALONE}
     return back.drawings.reply("files", order, mime, if_none_match, headers)
