@@ -130,7 +130,8 @@ def _pairs(arguments: argparse.Namespace, report: Report) -> tuple[list[Take], s
 
 
 def _seeds(text: str) -> tuple[int, ...]:
-    low, _, high = text.partition("-")
-    if not low.isdecimal() or (high and not high.isdecimal()) or int(high or low) < int(low):
+    low, dash, high = text.partition("-")
+    ends = (low, high if dash else low)
+    if not all(end.isdecimal() for end in ends) or int(ends[1]) < int(ends[0]):
         raise DataError(expected("seeds", "a number, or A-B with A <= B", repr(text)))
-    return tuple(range(int(low), int(high or low) + 1))
+    return tuple(range(int(ends[0]), int(ends[1]) + 1))

@@ -16,7 +16,7 @@ from rsavatar.motion.base import AbstractMotion
 from rsavatar.shutter.base import AbstractShutter
 from tests.core import small_subject
 
-LEARNED = ["gauhuman", "mad-avatar", "rs-avatar"]
+LEARNED = ["gauhuman", "flow+gauhuman", "cvr+gauhuman", "jamnet+gauhuman", "mad-avatar", "rs-avatar"]
 
 
 def method_of(case: Case) -> AbstractMethod:
