@@ -8,7 +8,7 @@ import anyio
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
 
-from services.api.access import READ, Who, read_form
+from services.api.access import READ, Caller, Who, read_form
 from services.api.deps import Back
 from services.api.gate import COOKIE
 from services.api.layout import page
@@ -46,6 +46,7 @@ async def log_in(request: Request, back: Back) -> Response:
     token = await anyio.to_thread.run_sync(tokens.find, back.store, secret)
     if token is None or token.name.startswith(tokens.SESSION):
         return ask(request, target, wrong=True)
+    request.state.caller = Caller(token.owner, tokens.covered(token.scopes), token.id)  # for the audit log
     seconds = back.settings.session_hours * HOUR
     _, session = await anyio.to_thread.run_sync(tokens.open_session, back.store, token, seconds)
     reply = RedirectResponse(target, 303)

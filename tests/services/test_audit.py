@@ -10,7 +10,7 @@ import httpx
 import pytest
 
 from services.settings import Settings
-from services.store import audit
+from services.store import audit, tokens
 from services.store.session import Store
 from tests.services.conftest import bearer, serving
 from tests.services.test_api_access import JOB
@@ -78,6 +78,17 @@ def test_requests_that_change_something_are_logged_with_their_outcome(closed: ht
     assert rest["next_cursor"] is None
     verdict = closed.get("/api/v1/audit/verify", headers=admin).json()
     assert verdict == {"whole": True, "rows": 3, "head": records[0]["sha256"], "broken_at": None}
+
+
+def test_a_login_is_logged_with_its_token_and_without_its_secret(closed: httpx.Client, store: Store) -> None:
+    token, secret = tokens.issue(store, "n", "ann", ["read"])
+    closed.post("/login", data={"token": secret})
+    closed.cookies.clear()
+    closed.post("/login", data={"token": "rsa_wrong"})
+    wrong, right = audit.page(store, None, 10)
+    assert (right.entry.actor, right.entry.token_id, right.entry.status) == ("ann", token.id, 303)
+    assert (wrong.entry.actor, wrong.entry.token_id, wrong.entry.status) == ("anonymous", None, 401)
+    assert "rsa_" not in str([wrong, right])
 
 
 def test_counts_and_latencies_are_for_those_who_may_read(
