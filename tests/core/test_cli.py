@@ -123,7 +123,7 @@ def test_the_folder_names_a_subject_that_is_named_nowhere(tmp_path: Path, monkey
         (["run", "nothing.toml"], "SPEC: expected a TOML file or one of draft, paper, smoke, got 'nothing.toml'"),
         (
             ["run", "draft"],
-            "method: expected one of rs-avatar, gauhuman, cvr+gauhuman, jamnet+gauhuman, flow+gauhuman, mad-avatar, oracle, got nothing; say --set method=...",
+            "method: expected one of rs-avatar, gauhuman, cvr+gauhuman, jamnet+gauhuman",
         ),
         (["run", "draft", "--set", "method=gauhuman"], "subject: expected a name, got nothing; say --set subject=..."),
         (["run", "draft", "--set", "method=x", "--set", "subject=a"], "method: expected one of"),
