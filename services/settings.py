@@ -50,12 +50,16 @@ class Settings(BaseSettings):
     max_entry_bytes: int = Field(default=256 << 20, ge=1024, description="largest file of a subject")
     max_entries: int = Field(default=50_000, ge=1, description="most files of a subject")
     check_seconds: float = Field(default=600.0, gt=0, description="time that the check of a subject may take")
+    api_processes: int = Field(default=1, ge=1, le=64, description="processes of the API that share its port")
     max_grid_jobs: int = Field(default=1000, ge=1, le=10_000, description="most jobs of one grid")
     ping_seconds: float = Field(default=15.0, gt=0, description="silence on an event stream before a comment is sent")
     poll_seconds: float = Field(default=0.4, gt=0, description="seconds between two looks of a stream at the store")
 
     render_seconds: float = Field(default=120.0, gt=0, description="time that a drawing may take, its queue included")
     render_idle_seconds: float = Field(default=600.0, gt=0, description="rest after which the render process ends")
+    render_socket: Path | None = Field(
+        default=None, description="unix socket of `python -m services.renderer PATH`; none = the API starts its own"
+    )
     drawings_mb: int = Field(default=512, ge=16, description="disk for finished drawings and exports")
 
     worker_concurrency: int = Field(default=1, ge=1, le=64, description="jobs that one worker trains at a time")

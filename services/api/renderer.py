@@ -15,9 +15,9 @@ import sys
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Client, Connection
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 from rsavatar.errors import SpecError
 from services.errors import ConflictError, RenderError
@@ -91,6 +91,13 @@ class RenderProcess:
             raise RenderError("render process", "an answer", got) from None
 
     def _start(self) -> Connection:
+        if self._settings.render_socket is not None:
+            try:
+                self._connection = cast(Connection, Client(str(self._settings.render_socket), "AF_UNIX"))
+            except OSError as error:
+                wanted = f"one that listens on {self._settings.render_socket} (RSAVATAR_RENDER_SOCKET)"
+                raise RenderError("render process", wanted, error) from None
+            return self._connection
         ours, theirs = socket.socketpair()
         threads = str(self._settings.threads)
         env = without_secrets(os.environ)

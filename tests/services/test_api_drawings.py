@@ -7,6 +7,8 @@ import json
 import os
 import signal
 import struct
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,10 +18,12 @@ import psutil
 import pytest
 from PIL import Image
 
+from rsavatar.errors import SpecError
 from services.api.drawings import DrawingCache, key_of
 from services.api.renderer import RenderProcess
 from services.errors import RenderError
-from services.settings import Settings, make_home
+from services.process import stop, terminate_with_parent
+from services.settings import ROOT, Settings, make_home
 from services.store import artifacts, jobs, leases, schema, subjects
 from services.store.records import Outcome, Point, Score, Submission
 from services.store.session import Store
@@ -220,6 +224,26 @@ def test_a_render_process_ends_for_want_of_orders_and_with_the_one_that_asks(tmp
         process._process.wait(20)
         assert process._process.returncode == 0
     process.close()
+
+
+def test_a_renderer_may_run_elsewhere_and_listen(tmp_path: Path) -> None:
+    path = tmp_path / "r.sock"
+    settings = Settings(home=tmp_path, render_socket=path)
+    absent = RenderProcess(settings, "views")
+    with pytest.raises(RenderError, match="expected one that listens on"):
+        absent.ask({"verb": "nothing"})
+    command = [sys.executable, "-m", "services.renderer", str(path)]
+    listener = subprocess.Popen(command, cwd=ROOT, preexec_fn=terminate_with_parent)  # noqa: PLW1509
+    try:
+        while not path.exists():
+            assert listener.poll() is None
+            time.sleep(0.05)
+        for lane in ("views", "files"):  # both at once, each on a connection of its own
+            with pytest.raises(SpecError, match="verb: expected one of view"):
+                RenderProcess(settings, lane).ask({"verb": "nothing"})
+        assert path.stat().st_mode & 0o777 == 0o600
+    finally:
+        stop(listener, 5.0)
 
 
 def test_a_process_that_cannot_start_is_a_clear_refusal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
