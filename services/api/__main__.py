@@ -5,9 +5,11 @@ from __future__ import annotations
 import sys
 
 import uvicorn
+from fastapi import FastAPI
 
 from services.api.app import create_app
 from services.errors import ServiceError
+from services.process import die_with_parent
 from services.settings import Settings, make_home, read_settings
 from services.store import tokens
 from services.store.session import Store
@@ -27,18 +29,27 @@ def tell_first_token(settings: Settings) -> None:
         store.close()
 
 
+def one_of_several() -> FastAPI:
+    """The application of one process among several that answer at the same address; it ends with their parent."""
+    die_with_parent()
+    return create_app(read_settings())
+
+
 def main() -> int:
     """Serve until stopped."""
     try:
         settings = read_settings()
         make_home(settings)
-        app = create_app(settings)
+        several = settings.api_processes > 1
+        app = "services.api.__main__:one_of_several" if several else create_app(settings)
         tell_first_token(settings)
     except ServiceError as error:
         print(error, file=sys.stderr)
         return 1
     uvicorn.run(
         app,
+        factory=several,
+        workers=settings.api_processes,
         host=settings.host,
         port=settings.port,
         timeout_graceful_shutdown=STREAMS_SECONDS,

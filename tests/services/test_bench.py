@@ -34,9 +34,10 @@ def test_a_request_is_what_a_server_reads() -> None:
 
 
 def test_a_service_is_measured_and_does_what_it_is_measured_for() -> None:
-    with host() as running:
+    with host(api_processes=2) as running:
         running.start("redis")
-        running.start("api")
+        api = running.start("api")
+        assert sum("--multiprocessing-fork" in " ".join(child.cmdline()) for child in api.children()) == 2
         found = {"submit": requests.submissions(running, TINY)}
         assert jobs.count_by_state(running.store)["queued"] == 2 + 20 + 20
         requests.fill(running, TINY.jobs)
