@@ -4,6 +4,7 @@
 # make check  format, lint, types, import contracts
 # make check-native  the kernels under address, undefined-behaviour and thread sanitizers
 # make soak   a thousand small trainings while something is killed every few seconds; SOAK='--jobs 100 --postgresql'
+# make paper-table ZJU=DIR  the paper's whole table, from ZJU-MoCap (my_377 ..) on disk
 # make bench  the long measurements; results in docs/benchmarks
 # make screenshots URL=http://127.0.0.1:8000   every page of a running service, into docs/screens
 # make studies  ablation, calibration, exposure, losses, robustness, superres: hours; JOBS=N at a time, SUBJECTS='DIR ...'
@@ -13,7 +14,7 @@ BIN := .venv/bin
 SETUP := .venv/.complete
 JOBS ?= 1
 
-.PHONY: setup demo up test check check-native soak bench screenshots clean studies
+.PHONY: setup demo up test check check-native soak bench screenshots clean studies paper-table
 .DEFAULT_GOAL := help
 
 help:
@@ -48,6 +49,10 @@ check-native: $(SETUP)
 
 soak: $(SETUP)
 	$(BIN)/python -m tests.system.soak $(SOAK)
+
+paper-table: $(SETUP)
+	@test -n "$(ZJU)" || { echo 'ZJU: expected the folder with my_377 .. my_394, got nothing (make paper-table ZJU=DIR)' >&2; exit 2; }
+	$(BIN)/python -m services.paper --zju "$(ZJU)"
 
 bench: $(SETUP)
 	$(BIN)/rsavatar bench render --json docs/benchmarks/render.json

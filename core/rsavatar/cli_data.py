@@ -58,6 +58,7 @@ def add_verbs(nouns: object, add: AddVerb) -> None:
     one.add_argument("--views", default="", metavar="A,B:C,D", help="training : held-out cameras; rest = all others")
     every = add(nouns, "build-zju", "rsavatar.cli_data:build_zju", "make the paper's whole benchmark", ZJU)
     every.add_argument("source", type=Path, metavar="ROOT")
+    every.add_argument("--only", default="", metavar="A,B", help="of the six subjects only these, such as 377,386")
     for parser in (one, every):
         _add_settings(parser)
     made = add(nouns, "studio", "rsavatar.cli_data:studio", "make a synthetic subject, without any download", STUDIO)
@@ -122,14 +123,14 @@ def build_rs(arguments: argparse.Namespace) -> int:
 def build_zju(arguments: argparse.Namespace) -> int:
     """``rsavatar data build-zju``: all six subjects; prints their folders."""
     from rsavatar.cli_progress import Display
-    from rsavatar.data.build_table import build_all
+    from rsavatar.data.build_table import build_all, find_subjects
     from rsavatar.events import to_json
     from rsavatar.metrics.base import protocol
 
     settings = _settings(arguments)
     with Display() as display:
         built = build_all(
-            arguments.source,
+            find_subjects(arguments.source, [name for name in arguments.only.split(",") if name]),
             arguments.out,
             settings,
             protocol(),

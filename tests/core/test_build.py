@@ -18,7 +18,7 @@ from rsavatar.data.build import Settings, build
 from rsavatar.data.build_card import readable
 from rsavatar.data.build_motion import displacements
 from rsavatar.data.build_plan import Clock
-from rsavatar.data.build_table import SUBJECTS, build_all
+from rsavatar.data.build_table import SUBJECTS, build_all, find_subjects
 from rsavatar.data.footage import Footage
 from rsavatar.data.footage_sources import open_footage
 from rsavatar.data.rolling import load
@@ -284,7 +284,7 @@ def test_the_papers_six_subjects(tmp_path: Path) -> None:
     first = write_zju_footage(tmp_path / "zju/my_377", 23, lambda _, n: pictures[n], range(23))
     for number in list(SUBJECTS)[1:]:
         shutil.copytree(first, tmp_path / f"zju/my_{number}", copy_function=os.link)
-    built = build_all(tmp_path / "zju", tmp_path / "rs", Settings(interpolator="copy"), PROTOCOL, 1)
+    built = build_all(find_subjects(tmp_path / "zju"), tmp_path / "rs", Settings(interpolator="copy"), PROTOCOL, 1)
     assert [each.name for each in built] == [f"zju-{number}" for number in SUBJECTS]
     subject = load(built[0].folder)
     assert subject.training == ("04", "10", "16", "22")
@@ -296,4 +296,7 @@ def test_the_papers_six_subjects(tmp_path: Path) -> None:
     assert "The paper has 354" in text
     shutil.rmtree(tmp_path / "zju/my_392")
     with pytest.raises(DataError, match="none for 392"):
-        build_all(tmp_path / "zju", tmp_path / "rs", Settings(), PROTOCOL, 1)
+        find_subjects(tmp_path / "zju")
+    assert list(find_subjects(tmp_path / "zju", ["386"])) == ["386"]
+    with pytest.raises(DataError, match="some of 377"):
+        find_subjects(tmp_path / "zju", ["400"])

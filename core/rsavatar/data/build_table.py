@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,27 +28,31 @@ class Built:
     card: Mapping[str, Any]
 
 
-def find_subjects(root: Path) -> dict[str, Path]:
-    """The folders of all six subjects under ``root``.
+def find_subjects(root: Path, only: Sequence[str] = ()) -> dict[str, Path]:
+    """The folders of all six subjects under ``root``, or of some of them.
 
     Raises:
         DataError: naming those that are not there.
     """
+    unknown = [number for number in only if number not in SUBJECTS]
+    if unknown:
+        raise DataError(expected("subjects", f"some of {', '.join(SUBJECTS)}", ", ".join(unknown)))
     found = {
         number: folder
         for number in SUBJECTS
         for folder in (root / pattern.format(number) for pattern in reversed(_FOLDERS))
         if folder.is_dir()
     }
-    missing = [number for number in SUBJECTS if number not in found]
+    wanted_ones = [number for number in SUBJECTS if number in only or not only]
+    missing = [number for number in wanted_ones if number not in found]
     if missing:
         wanted = "folders my_377 .. my_394 (refined) or CoreView_377 .. (original) of the paper's six subjects"
         raise DataError(expected(f"{root} subjects", wanted, f"none for {', '.join(missing)}"))
-    return {number: found[number] for number in SUBJECTS}
+    return {number: found[number] for number in wanted_ones}
 
 
 def build_all(
-    root: Path,
+    folders: Mapping[str, Path],
     out: Path,
     settings: Settings,
     protocol: Mapping[str, object],
@@ -57,12 +61,11 @@ def build_all(
 ) -> list[Built]:
     """Builds ``out/zju-<number>`` of every subject, and ``out/RS-ZJU.md``; what is built already is kept.
 
-    Arguments are those of ``build.build``.
+    ``folders`` are those of ``find_subjects``; the other arguments are those of ``build.build``.
 
     Raises:
         DataError: see there, and where a subject is missing.
     """
-    folders = find_subjects(root)
     footages = {number: open_footage(folder) for number, folder in folders.items()}  # every mistake before any work
     built = []
     for number, footage in footages.items():
@@ -88,7 +91,7 @@ def summary(built: list[Built], period: int) -> str:
         lines.append(f"| {each.name} | {numbers} |")
     total = sum(each.card["frames"] for each in built)
     lines += ["", f"{total} frames a view in all, K = {period}."]
-    if period == 11 and total != sum(SUBJECTS.values()):
+    if period == 11 and len(built) == len(SUBJECTS) and total != sum(SUBJECTS.values()):
         wanted = ", ".join(f"{name}: {count}" for name, count in SUBJECTS.items())
         lines.append(f"The paper has {sum(SUBJECTS.values())} ({wanted}): these sequences have another length.")
     first = built[0].card
