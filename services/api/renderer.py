@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Client, Connection
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 from rsavatar.errors import SpecError
 from services.errors import ConflictError, RenderError
@@ -93,7 +93,7 @@ class RenderProcess:
     def _start(self) -> Connection:
         if self._settings.render_socket is not None:
             try:
-                self._connection = cast(Connection, Client(str(self._settings.render_socket), "AF_UNIX"))
+                self._connection = Client(str(self._settings.render_socket), "AF_UNIX")
             except OSError as error:
                 wanted = f"one that listens on {self._settings.render_socket} (RSAVATAR_RENDER_SOCKET)"
                 raise RenderError("render process", wanted, error) from None
