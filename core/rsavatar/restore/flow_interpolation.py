@@ -68,7 +68,7 @@ def _paths(here: Bytes, to: Flow, back: Flow, opposite: Flow | None) -> _Paths:
     trust = _trust(to, back)
     bend: Floats = np.zeros_like(to)
     if opposite is not None:
-        bend = (to + opposite) / 2
+        bend = np.asarray((to + opposite) / 2, np.float32)
         # A body's velocity changes little between two pictures; where it seems to, one of the flows is wrong.
         sudden = np.linalg.norm(bend, axis=-1) / (_TRUSTED_PX + 0.25 * np.linalg.norm(to, axis=-1))
         bend *= (trust * np.exp2(-(sudden**2)))[..., None].astype(np.float32)

@@ -51,8 +51,8 @@ class IFNet(nn.Module):
             flow, mask = flow + more_flow, mask + more_mask
         share = mask.sigmoid()
         contexts = self.contextnet(first, flow[:, :2]), self.contextnet(second, flow[:, 2:])
-        seen = torch.cat([first, second, *_moved(first, second, flow), mask, flow], 1)
-        residual = 2 * self.unet(seen, *contexts) - 1
+        everything = torch.cat([first, second, *_moved(first, second, flow), mask, flow], 1)
+        residual = 2 * self.unet(everything, *contexts) - 1
         return Between((_blend(first, second, flow, share) + residual).clamp(0, 1), flow, share)
 
 
