@@ -4,36 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import (
-    JSON,
-    BigInteger,
-    Double,
-    ForeignKey,
-    Index,
-    Integer,
-    MetaData,
-    String,
-    Text,
-    UniqueConstraint,
-    false,
-)
-from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+from sqlalchemy import BigInteger, ForeignKey, Index, String, Text, UniqueConstraint, false
+from sqlalchemy.orm import Mapped, mapped_column
 
-LOCAL = "local"  # owner of what comes from this machine without a token
-NAMING = {
-    "ix": "ix_%(table_name)s_%(column_0_N_name)s",
-    "uq": "uq_%(table_name)s_%(column_0_N_name)s",
-    "fk": "fk_%(table_name)s_%(column_0_N_name)s",
-    "pk": "pk_%(table_name)s",
-}
-RowId = BigInteger().with_variant(Integer, "sqlite")  # SQLite counts by itself only in an INTEGER key
+from services.store.base import LOCAL, Base, RowId
+from services.store.tables_access import AuditRow, BenchmarkRow, OwnerRow, TokenRow
 
-
-class Base(DeclarativeBase):
-    """Base of the tables; constraints have names, so that migrations can find them."""
-
-    metadata = MetaData(naming_convention=NAMING)
-    type_annotation_map = {float: Double, dict[str, Any]: JSON, list[Any]: JSON}  # noqa: RUF012  (SQLAlchemy's protocol)
+# fmt: off
+__all__ = [  # all tables are found here
+    "LOCAL", "ArtifactRow", "AuditRow", "Base", "BenchmarkRow", "BlobRow", "CheckpointRow", "EventRow", "GridRow", "JobRow",
+    "OwnerRow", "PointRow", "ResultRow", "SchedulerRow", "ScoreRow", "StageRow", "SubjectRow", "TagRow", "TokenRow",
+]
+# fmt: on
 
 
 class JobRow(Base):
@@ -236,19 +218,6 @@ class StageRow(Base):
     error: Mapped[str | None] = mapped_column(Text)
 
 
-class OwnerRow(Base):
-    """Somebody who submits jobs, known from the first one. Limits that are none are the settings'."""
-
-    __tablename__ = "owners"
-
-    name: Mapped[str] = mapped_column(String(64), primary_key=True)
-    max_running: Mapped[int | None]
-    max_queued: Mapped[int | None]
-    share: Mapped[float] = mapped_column(default=1.0)
-    served_at: Mapped[float] = mapped_column(default=0.0)  # when a job of theirs was last claimed
-    created_at: Mapped[float]
-
-
 class GridRow(Base):
     """Many jobs of one request: ``base`` varied along ``axes``, with ``includes`` and without ``excludes``."""
 
@@ -274,55 +243,3 @@ class TagRow(Base):
 
     job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True)
     tag: Mapped[str] = mapped_column(String(64), primary_key=True)
-
-
-class TokenRow(Base):
-    """A bearer token, of which only the hash is kept; ``prefix`` shows people which one it is."""
-
-    __tablename__ = "tokens"
-
-    id: Mapped[str] = mapped_column(String(36), primary_key=True)
-    name: Mapped[str] = mapped_column(String(128))
-    owner: Mapped[str] = mapped_column(String(64), index=True)
-    sha256: Mapped[str] = mapped_column(String(64), unique=True)
-    prefix: Mapped[str] = mapped_column(String(16))
-    scopes: Mapped[list[Any]]
-    created_at: Mapped[float]
-    expires_at: Mapped[float | None]
-    revoked_at: Mapped[float | None]
-    last_used_at: Mapped[float | None]
-
-
-class AuditRow(Base):
-    """Who did what, appended only; every row names the hash of the one before."""
-
-    __tablename__ = "audit"
-    __table_args__ = ({"sqlite_autoincrement": True},)
-
-    id: Mapped[int] = mapped_column(RowId, primary_key=True, autoincrement=True)
-    at: Mapped[float] = mapped_column(index=True)
-    actor: Mapped[str] = mapped_column(String(64), index=True)
-    token_id: Mapped[str | None] = mapped_column(String(36))
-    verb: Mapped[str] = mapped_column(String(64))
-    object: Mapped[str] = mapped_column(String(255), index=True)
-    outcome: Mapped[str] = mapped_column(String(32))
-    status: Mapped[int | None]
-    ip: Mapped[str | None] = mapped_column(String(64))
-    request_id: Mapped[str | None] = mapped_column(String(64))
-    detail: Mapped[dict[str, Any]]
-    previous_sha256: Mapped[str] = mapped_column(String(64))
-    sha256: Mapped[str] = mapped_column(String(64), unique=True)
-
-
-class BenchmarkRow(Base):
-    """What a benchmark measured, where and on which commit."""
-
-    __tablename__ = "benchmarks"
-    __table_args__ = (Index("ix_benchmarks_name_id", "name", "id"),)
-
-    id: Mapped[str] = mapped_column(String(36), primary_key=True)
-    name: Mapped[str] = mapped_column(String(64))
-    commit: Mapped[str] = mapped_column(String(64))
-    machine: Mapped[dict[str, Any]]
-    payload: Mapped[dict[str, Any]]
-    created_at: Mapped[float]
