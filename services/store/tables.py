@@ -12,8 +12,9 @@ from services.store.tables_access import AuditRow, BenchmarkRow, OwnerRow, Token
 
 # fmt: off
 __all__ = [  # all tables are found here
-    "LOCAL", "ArtifactRow", "AuditRow", "Base", "BenchmarkRow", "BlobRow", "CheckpointRow", "EventRow", "GridRow", "JobRow",
-    "OwnerRow", "PointRow", "ResultRow", "SchedulerRow", "ScoreRow", "StageRow", "SubjectRow", "TagRow", "TokenRow",
+    "LOCAL", "ArtifactRow", "AuditRow", "Base", "BenchmarkRow", "BlobRow", "CheckpointRow", "EventRow", "GridRow",
+    "JobRow", "OwnerRow", "PointRow", "ResultRow", "SchedulerRow", "ScoreRow", "StageRow", "SubjectRow", "TagRow",
+    "TokenRow",
 ]
 # fmt: on
 
