@@ -9,7 +9,7 @@ from fastapi import FastAPI
 
 from services.api.app import create_app
 from services.errors import ServiceError
-from services.process import die_with_parent
+from services.process import die_with_parent, share_arenas
 from services.settings import Settings, make_home, read_settings
 from services.store import tokens
 from services.store.session import Store
@@ -32,11 +32,13 @@ def tell_first_token(settings: Settings) -> None:
 def one_of_several() -> FastAPI:
     """The application of one process among several that answer at the same address; it ends with their parent."""
     die_with_parent()
+    share_arenas()
     return create_app(read_settings())
 
 
 def main() -> int:
     """Serve until stopped."""
+    share_arenas()
     try:
         settings = read_settings()
         make_home(settings)

@@ -6,12 +6,11 @@ the first and the last of the whole curve.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from itertools import groupby
-from operator import itemgetter
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, cast
 
-from sqlalchemy import select
+from sqlalchemy import CursorResult, Table, bindparam, func, select
+from sqlalchemy.orm import Session
 
 from services.errors import NotFoundError
 from services.store.session import Store
@@ -19,6 +18,13 @@ from services.store.tables import JobRow, PointRow
 
 POINTS = 1000  # most points of a curve, unless fewer are asked for
 LEAST = 4  # first, last, lowest, highest
+
+POINTS_OF = cast(Table, PointRow.__table__)
+CURVE = (
+    select(POINTS_OF.c.step, POINTS_OF.c.value)
+    .where(POINTS_OF.c.job_id == bindparam("of_job"), POINTS_OF.c.key == bindparam("of_key"))
+    .order_by(POINTS_OF.c.step)
+)
 
 Curve = list[tuple[int, float]]
 
@@ -36,18 +42,29 @@ def of_jobs(
         source = {job_id: reused or job_id for job_id, reused in session.execute(known)}
         if missing := next((job_id for job_id in job_ids if job_id not in source), None):
             raise NotFoundError("job", "the id of a job", missing)
-        columns = (PointRow.job_id, PointRow.key, PointRow.step, PointRow.value)
-        query = select(*columns).where(PointRow.job_id.in_(set(source.values()))).order_by(*columns[:3])
-        rows = session.execute(query.where(PointRow.key.in_(keys)) if keys else query).all()
-    drawn: dict[str, dict[str, Curve]] = {}
-    for job_id, key, curve in _curves(rows):
-        drawn.setdefault(job_id, {})[key] = thin(curve, points)
-    return {job_id: drawn.get(source[job_id], {}) for job_id in job_ids}
+        drawn: dict[str, dict[str, Curve]] = {job_id: {} for job_id in source.values()}
+        for job_id, curves in drawn.items():
+            for key in keys or _keys(session, job_id):
+                if curve := _read(session, job_id, key):
+                    curves[key] = thin(curve, points)
+    return {job_id: drawn[source[job_id]] for job_id in job_ids}
 
 
-def _curves(rows: Sequence[Any]) -> Iterator[tuple[str, str, Curve]]:
-    for (job_id, key), group in groupby(rows, itemgetter(0, 1)):
-        yield job_id, key, [(row[2], row[3]) for row in group]
+def _keys(session: Session, job_id: str) -> list[str]:
+    """Names of a job's curves, one step of the index each, however many points there are."""
+    found: list[str] = []
+    while True:
+        query = select(func.min(PointRow.key)).where(PointRow.job_id == job_id)
+        key = session.scalar(query.where(PointRow.key > found[-1]) if found else query)
+        if key is None:
+            return found
+        found.append(key)
+
+
+def _read(session: Session, job_id: str, key: str) -> Curve:
+    """All points of one curve, as the driver hands them out: wrapping a long curve costs more than reading it."""
+    result = session.execute(CURVE, {"of_job": job_id, "of_key": key})
+    return list(cast("CursorResult[Any]", result).cursor.fetchall())
 
 
 def thin(curve: Curve, points: int) -> Curve:
