@@ -59,6 +59,7 @@ bench: $(SETUP)
 	$(BIN)/rsavatar bench growth --json docs/benchmarks/growth.json
 	$(BIN)/rsavatar bench train --json docs/benchmarks/train.json
 	$(BIN)/rsavatar bench stability --json docs/benchmarks/stability.json
+	$(BIN)/rsavatar bench builder --json docs/benchmarks/builder.json
 	$(BIN)/python -m services.bench --json docs/benchmarks/service.json
 
 studies: $(SETUP)
