@@ -26,6 +26,7 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rate", type=float, default=1e-4, help="learning rate (default: the authors' 1e-4)")
     parser.add_argument("--instants", type=int, default=3, help="CVR: instants in a step (default: 3)")
     parser.add_argument("--warmup", type=float, default=0.25, help="CVR from nothing: part that teaches its flow alone")
+    parser.add_argument("--slow", type=float, default=0.1, help="CVR with --init: rate of its flow and scale networks")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--held-out", type=int, default=8, help="takes to validate on (default: 8)")
     parser.add_argument("--every", type=int, default=500, help="steps between looks at these")

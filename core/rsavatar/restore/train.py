@@ -27,7 +27,6 @@ from rsavatar.restore.sampling import Batch, Sampler
 from rsavatar.restore.weights import NAMES, Name, Shape, header_of, load_state, read_state
 
 FINAL_RATE = 0.02  # of the learning rate, at the end of its cosine
-SLOW_PARTS = 0.1  # of the learning rate, for CVR's flow and scale networks when they start from weights
 BODY_MARGIN = 2  # pixels that the body region of the validation grows by
 
 
@@ -46,6 +45,7 @@ class Recipe:
     rate: float = 1e-4
     instants: int = 3  # of CVR's in a step: all that the data know, or a draw of fewer
     warmup: float = 0.25  # CVR from nothing: part of the training that teaches its flow alone
+    slow: float = 0.1  # of the rate, for CVR's flow and scale networks when they start from weights (the authors')
     seed: int = 0
     held_out: int = 8  # takes at the end that are validated on
     every: int = 500  # steps between looks at these
@@ -58,9 +58,12 @@ class Recipe:
         if self.columns % 64 or not 0 < self.width <= 1 or min(counts) < 1:
             wanted = "columns a multiple of 64, width in (0, 1], steps, batch, every, shrink and instants of at least 1"
             raise DataError(expected("recipe", wanted, (self.columns, self.width, *counts)))
-        if not (self.rate > 0 and self.minutes > 0 and 0 <= self.warmup < 1 and self.held_out >= 0):
-            got = (self.rate, self.minutes, self.warmup, self.held_out)
-            raise DataError(expected("recipe", "rate and minutes above 0, warmup in [0, 1), held_out not below 0", got))
+        shares = 0 <= self.warmup < 1 and 0 <= self.slow <= 1
+        if not (self.rate > 0 and self.minutes > 0 and shares and self.held_out >= 0):
+            wanted = "rate and minutes above 0, warmup in [0, 1), slow in [0, 1], held_out not below 0"
+            raise DataError(
+                expected("recipe", wanted, (self.rate, self.minutes, self.warmup, self.slow, self.held_out))
+            )
 
     @property
     def shape(self) -> Shape:
@@ -102,7 +105,7 @@ class Trainer:
         else:
             load_state(self.network, read_state(start.init), f"weights {start.init}")
         self.perception = Perception(start.vgg).to(device) if start.vgg else None
-        self.optimizer = torch.optim.Adam(_groups(self.network, recipe.rate, start.init is not None))
+        self.optimizer = torch.optim.Adam(_groups(self.network, recipe, start.init is not None))
         self.curve: list[dict[str, float]] = []
         self.step, self.seconds = 0, 0.0
 
@@ -255,13 +258,13 @@ def _psnr(image: Tensor, truth: Tensor, mask: Tensor) -> float:
 _LARGEST_GRADIENT: dict[Name, float] = {"jamnet": 50.0, "cvr": 5.0}
 
 
-def _groups(network: nn.Module, rate: float, started: bool) -> list[dict[str, Any]]:
-    """CVR's flow and scale networks learn at a tenth of the rate once they are good (the authors' rates)."""
+def _groups(network: nn.Module, recipe: Recipe, started: bool) -> list[dict[str, Any]]:
+    """CVR's flow and scale networks learn more slowly once they are good."""
     slow = [p for name, p in network.named_parameters() if name.startswith(("net_flow", "net_scale")) and started]
     known = set(map(id, slow))
     fast = [p for p in network.parameters() if id(p) not in known]
-    groups = [{"params": fast, "lr": rate, "share": 1.0}, {"params": slow, "lr": rate, "share": SLOW_PARTS}]
-    return [group for group in groups if group["params"]]
+    groups = [{"params": fast, "share": 1.0}, {"params": slow, "share": recipe.slow}]
+    return [{**group, "lr": recipe.rate} for group in groups if group["params"]]
 
 
 def _device(name: str) -> torch.device:
