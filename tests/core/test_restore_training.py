@@ -159,6 +159,7 @@ class TestTrainer:
         start = Start(init=first, vgg=tmp_path / "vgg.pth")
         made = Trainer(recipe(steps=1), takes, tmp_path / "b.safetensors", start).run()
         assert json.loads(made.with_suffix(".json").read_text())["recipe"]["perceptual_terms"] is True
+        assert "1 steps on blocks, then 1 steps on blocks" in load("jamnet", (made,))[1].label
 
     @pytest.mark.parametrize("words", [{"columns": 100}, {"width": 0.0}, {"steps": 0}, {"rate": 0.0}, {"model": "x"}])
     def test_a_recipe_that_cannot_be_is_named(self, words: dict[str, object]) -> None:

@@ -24,7 +24,7 @@ from rsavatar.restore.jamnet import JAMNet
 from rsavatar.restore.losses import Perception, cvr_loss, flow_loss, jamnet_loss
 from rsavatar.restore.pairs import Take, shrunk
 from rsavatar.restore.sampling import Batch, Sampler
-from rsavatar.restore.weights import NAMES, Name, Shape, header_of, load_state, read_state
+from rsavatar.restore.weights import NAMES, Name, Shape, header_of, load_state, read_header, read_state
 
 FINAL_RATE = 0.02  # of the learning rate, at the end of its cosine
 BODY_MARGIN = 2  # pixels that the body region of the validation grows by
@@ -209,7 +209,7 @@ class Trainer:
             "minutes": None if math.isinf(self.recipe.minutes) else self.recipe.minutes,
             "steps_done": self.step,
             "perceptual_terms": self.start.vgg is not None,
-            "init": None if self.start.init is None else hashlib.sha256(self.start.init.read_bytes()).hexdigest(),
+            "before": None if self.start.init is None else json.loads(read_header(self.start.init)["recipe"]),
             "torch": torch.__version__,
             "device": self.start.device,
         }

@@ -214,4 +214,8 @@ def _label(files: tuple[Path, ...], header: Mapping[str, str]) -> str:
     recipe, width = json.loads(header["recipe"]), float(header["width"])
     size = "full width" if width == 1 else f"reduced width {width:g}"
     source = "shipped, " if files[0].parent == SHIPPED else ""
-    return f"{source}trained by this project ({names}: {size}, {recipe['steps_done']} steps on {recipe['data']})"
+    rounds = [recipe]
+    while rounds[0].get("before"):
+        rounds.insert(0, rounds[0]["before"])
+    steps = ", then ".join(f"{done['steps_done']} steps on {done['data']}" for done in rounds)
+    return f"{source}trained by this project ({names}: {size}, {steps})"
