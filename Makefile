@@ -7,7 +7,7 @@
 # make paper-table ZJU=DIR  the paper's whole table, from ZJU-MoCap (my_377 ..) on disk
 # make bench  the long measurements; results in docs/benchmarks
 # make screenshots URL=http://127.0.0.1:8000   every page of a running service, into docs/screens
-# make studies  ablation, calibration, exposure, losses, robustness, superres: hours; JOBS=N at a time, SUBJECTS='DIR ...'
+# make studies  ablation, calibration, exposure, losses, robustness, skips, superres: hours; JOBS=N at a time, SUBJECTS='DIR ...'
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -63,7 +63,7 @@ bench: $(SETUP)
 	$(BIN)/python -m services.bench --json docs/benchmarks/service.json
 
 studies: $(SETUP)
-	for name in ablation calibration losses robustness superres; do \
+	for name in ablation calibration losses robustness skips superres; do \
 		$(BIN)/rsavatar bench $$name --jobs $(JOBS) $(if $(SUBJECTS),--subjects $(SUBJECTS)) --json docs/benchmarks/$$name.json || exit 1; \
 	done
 	$(BIN)/rsavatar bench restore --jobs $(JOBS) $(if $(SUBJECTS),--subjects $(SUBJECTS)) --json docs/benchmarks/restoration.json
