@@ -20,6 +20,7 @@ from rsavatar.spec import JobSpec  # noqa: E402
 from services.worker.child import serve  # noqa: E402
 
 STEP_MS = "RSAVATAR_BENCH_STEP_MS"
+REPORT_EVERY = 25  # steps, as training does
 INSTANTS = "instants.json"
 
 
@@ -52,7 +53,9 @@ def run(
         work(step_seconds)
         if should_stop():
             raise errors.Interrupted("asked to stop")
-        report(events.Progress("train", step, spec.iterations, time.monotonic() - started, 1.0 / step, None, 7000))
+        if step % REPORT_EVERY == 0 or step == spec.iterations:
+            seconds = time.monotonic() - started
+            report(events.Progress("train", step, spec.iterations, seconds, 1.0 / step, None, 7000))
     used = time.process_time()
     found = {
         "spec": spec.model_dump(mode="json", by_alias=True),

@@ -17,9 +17,10 @@ answered, which finds the most that the service can do; *at a pace* latency coun
 was due, so that falling behind shows. Submissions are of jobs that nobody has run, with audit log and wake-up; pages
 are of 50 jobs by turns: the newest, from the middle, by state, by method, by a filter. Logging is the heartbeat of a
 running job (lease, events, metrics, progress in one transaction), 20 jobs at once from 4 processes. Dispatch overhead
-is from the end of one job's work to the first instruction of the next job's process. Supervision is the worker's CPU
-time by that of a job whose steps take 25 ms. Recovery is from the loss of a worker to the next attempt of its job:
-killed, its death is proven on the same host; silent (stopped), its lease must run out.
+is from the end of one job's work to the first instruction of the next job's process. Logging and heartbeats cost the
+worker's CPU time while a job runs, beyond that of an idle worker; its steps take 25 ms of one core, every 25th is told.
+Recovery is from the loss of a worker to the next attempt of its job: killed, its death is proven on the same host;
+silent (stopped), its lease must run out.
 """
 ELSEWHERE = """\
 Others were measured by others, on other machines: the ratios say in which league a figure plays, not who wins a race.

@@ -20,6 +20,7 @@ class Sizes:
     dispatches: int = 40
     busy_steps: int = 1200
     step_ms: float = 25.0  # as a training step on two cores takes
+    idle_seconds: float = 20.0  # in which a worker without a job is watched
     lease_seconds: float = 75.0  # the default of the settings
 
 
@@ -32,6 +33,7 @@ LITTLE = Sizes(
     curve_points=600,
     beats=5,
     dispatches=4,
-    busy_steps=40,
+    busy_steps=80,
+    idle_seconds=1.0,
     lease_seconds=3.0,
 )

@@ -100,19 +100,30 @@ def dispatch(sizes: Sizes) -> Found:
 
 
 def overhead(sizes: Sizes) -> Found:
-    """CPU time of the worker while it supervises a busy job, by that of the job."""
+    """CPU time of the worker while a job runs, beyond what it uses without one, by that of the job."""
     os.environ[STEP_MS] = str(sizes.step_ms)
     with host(**CHILD) as running:
         running.start("redis")
         worker = running.start("worker")
         _settle(worker)
-        before = worker.cpu_times()
+        began, idle = time.monotonic(), _cpu_seconds(worker)
+        time.sleep(sizes.idle_seconds)
+        idle_share = (_cpu_seconds(worker) - idle) / (time.monotonic() - began)
         (job_id,) = submit(running.store, 1, sizes.busy_steps)
-        _wait(lambda: jobs.get(running.store, job_id).state == State.SUCCEEDED)
-        after = worker.cpu_times()
-        used = after.user + after.system - before.user - before.system
-        of_the_job = _instants(running, job_id)["cpu_seconds"]
-        return {"overhead_percent": 100.0 * used / of_the_job, "job_cpu_s": of_the_job, "worker_cpu_s": used}
+        _wait(lambda: jobs.get(running.store, job_id).step > 0)
+        first, began, used = jobs.get(running.store, job_id).step, time.monotonic(), _cpu_seconds(worker)
+        _wait(lambda: jobs.get(running.store, job_id).step > 0.9 * sizes.busy_steps)
+        last, used = jobs.get(running.store, job_id).step, _cpu_seconds(worker) - used
+        job = (last - first) * sizes.step_ms / 1e3
+        more = max(0.0, used - idle_share * (time.monotonic() - began))
+        jobs.cancel(running.store, job_id)
+    found = {"overhead_percent": 100.0 * more / job, "job_cpu_s": job, "worker_cpu_s": used}
+    return found | {"idle_worker_percent": 100.0 * idle_share}
+
+
+def _cpu_seconds(process: psutil.Process) -> float:
+    times = process.cpu_times()
+    return times.user + times.system
 
 
 def recovery(sizes: Sizes) -> Found:

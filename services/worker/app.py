@@ -56,7 +56,8 @@ def serve(settings: Settings) -> None:
     signals.worker_ready.connect(start_sweeping, weak=False)
     signals.worker_shutting_down.connect(stop_jobs, weak=False)
     try:
-        app.worker_main(["worker", "--pool=threads", "--without-gossip", "--without-mingle", "--loglevel=INFO"])
+        quiet = ("--without-gossip", "--without-mingle", "--without-heartbeat")  # nobody listens
+        app.worker_main(["worker", "--pool=threads", *quiet, "--loglevel=INFO"])
     finally:
         crew.stopping.set()
         for thread in (sweeper, examiner):

@@ -31,6 +31,7 @@ from services.worker.reporter import Reporter
 from services.worker.tenure import Tenure, first_line
 
 ENDINGS = frozenset({"result", "failed", "interrupted"})
+PLAIN = json.JSONDecoder(parse_constant=lambda _: None)  # NaN is no JSON
 LAST_WORDS_SECONDS = 5.0  # for the pipe to drain after the process has ended
 FROZEN_SECONDS = 1.0  # longest time between two looks of a worker that runs
 STACKS_SECONDS = 0.5  # for a process that hangs to write where, before it is killed
@@ -113,7 +114,7 @@ class Supervisor:
         with stream:
             for line in stream:
                 try:
-                    self._messages.put(json.loads(line, parse_constant=lambda _: None))  # NaN is no JSON
+                    self._messages.put(PLAIN.decode(line.decode()))
                 except ValueError:
                     log.warning("job %s said something that is not JSON", self._claim.job_id)
         self._messages.put(None)
