@@ -9,6 +9,7 @@ import os
 import pwd
 import shutil
 import signal
+import stat
 import subprocess
 import tempfile
 import time
@@ -40,9 +41,9 @@ class Server:
     """A server on a unix socket. It refuses root, so root runs it as somebody who may do nothing."""
 
     def __init__(self, binaries: Path) -> None:
-        self._binaries = binaries
         self.folder = Path(tempfile.mkdtemp(prefix="rsavatar-pg-"))
         self._user = self._somebody()
+        self._binaries = self._within_reach(binaries)
         self._numbers = itertools.count()
         self._process: subprocess.Popen[bytes] | None = None
         self._call("initdb", "-D", str(self.folder / "data"), "-U", "rsavatar", "-A", "trust", "--no-sync")
@@ -54,6 +55,14 @@ class Server:
         user = "postgres" if "postgres" in names else "nobody"
         shutil.chown(self.folder, user)
         return user
+
+    def _within_reach(self, binaries: Path) -> Path:
+        """The binaries, or a copy of their installation where that user may not enter their folders (a root's home)."""
+        closed = [folder for folder in binaries.resolve().parents if not folder.stat().st_mode & stat.S_IXOTH]
+        if self._user is None or not closed:
+            return binaries
+        shutil.copytree(binaries.parent, self.folder / "server")
+        return self.folder / "server" / binaries.name
 
     def _call(self, program: str, *words: str) -> None:
         command = [str(self._binaries / program), *words]
