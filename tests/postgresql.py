@@ -61,8 +61,12 @@ class Server:
         closed = [folder for folder in binaries.resolve().parents if not folder.stat().st_mode & stat.S_IXOTH]
         if self._user is None or not closed:
             return binaries
-        shutil.copytree(binaries.parent, self.folder / "server")
-        return self.folder / "server" / binaries.name
+        installation, package = binaries.parent, binaries.parents[1]
+        copy = self.folder / "server" / package.name / installation.name
+        shutil.copytree(installation, copy)
+        if (libraries := package.with_name(f"{package.name}.libs")).is_dir():  # a wheel's, found beside the package
+            shutil.copytree(libraries, self.folder / "server" / libraries.name)
+        return copy / binaries.name
 
     def _call(self, program: str, *words: str) -> None:
         command = [str(self._binaries / program), *words]
