@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from services.settings import Settings
+
 
 @dataclass(frozen=True)
 class Sizes:
@@ -21,7 +23,7 @@ class Sizes:
     busy_steps: int = 1200
     step_ms: float = 25.0  # as a training step on two cores takes
     idle_seconds: float = 20.0  # in which a worker without a job is watched
-    lease_seconds: float = 75.0  # the default of the settings
+    lease_seconds: float = float(Settings.model_fields["lease_seconds"].default)
 
 
 WHOLE = Sizes()

@@ -24,7 +24,7 @@ from services.store.turn import Turn
 
 OUTAGES = (OperationalError, InterfaceError, PoolTimeoutError)  # of a database that may come back
 CONNECT_SECONDS = 5
-PRAGMAS = ("journal_mode=WAL", "foreign_keys=ON", "synchronous=NORMAL", "busy_timeout=60000", "cache_size=-4000")
+PRAGMAS = ("journal_mode=WAL", "foreign_keys=ON", "synchronous=NORMAL", "busy_timeout=60000", "cache_size=-2000")
 
 
 class db_now(FunctionElement[float]):  # noqa: N801  (reads as the SQL function that it is)
