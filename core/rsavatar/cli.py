@@ -152,7 +152,8 @@ def _add_local(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     run.add_argument("--out", type=Path, metavar="DIR", help="where to write (default: runs/SUBJECT-METHOD-HASH)")
 
     bench = _add(verbs, "bench", "rsavatar.cli_local:bench", "measure speed or stability on this machine")
-    bench.add_argument("name", choices=["render", "growth", "train", "stability", "builder", *STUDIES])
+    names = ["render", "growth", "train", "stability", "builder", *STUDIES]
+    bench.add_argument("name", metavar="NAME", choices=names, help=", ".join(names))
     bench.add_argument("--json", type=Path, metavar="FILE", help="write the figures here as well")
     studies = bench.add_argument_group("of " + ", ".join(STUDIES), "many jobs; one that was cut goes on with --json")
     where = "folders, studio-N, studio-N-exposed (also of train)"

@@ -249,8 +249,8 @@ def test_subjects_are_made_known(say: Any, tmp_path: Path) -> None:
     (tmp_path / "annots.npy").touch()
     status, printed = say("subjects", "--add", "mine", str(tmp_path))
     assert status == 0
-    assert re.search(r"^studio +built in$", printed, re.MULTILINE)
-    assert re.search(rf"^mine +{re.escape(str(tmp_path))}$", printed, re.MULTILINE)
+    assert re.search(r"^studio +ready +built in$", printed, re.MULTILINE)
+    assert re.search(rf"^mine +ready +{re.escape(str(tmp_path))}$", printed, re.MULTILINE)
 
 
 def test_a_reader_that_stops_reading_is_no_error(service: Service) -> None:

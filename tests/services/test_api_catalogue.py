@@ -109,26 +109,6 @@ def test_health_readiness_and_counts(client: httpx.Client) -> None:
     assert "rsavatar_oldest_wait_seconds 0." in text
 
 
-def test_pages_show_jobs_results_and_no_inline_code(client: httpx.Client, store: Store) -> None:
-    empty = client.get("/").text
-    assert "No jobs yet" in empty
-    job = post(client).json()["id"]
-    waiting = client.get("/").text
-    assert f"/jobs/{job}" in waiting
-    finish(store)
-    index, page = client.get("/").text, client.get(f"/jobs/{job}").text
-    assert "21.50" in index
-    assert "GauHuman" in index
-    assert '<polyline points="0.0,' in page
-    for text in (empty, index, page):
-        assert " style=" not in text
-        assert "<style" not in text
-        assert "onclick" not in text
-        assert text.count("<script") == text.count('<script type="module" src="/static/') == 1
-        assert "http://" not in text.replace("http://www.w3.org", "")
-    assert client.get("/jobs/00000000-0000-7000-8000-000000000000").status_code == 404
-
-
 def test_static_files_name_no_other_site(untouched: httpx.Client) -> None:
     for name in ("style.css", "live.js", "icon.svg"):
         text = untouched.get(f"/static/{name}").text.replace("http://www.w3.org/2000/svg", "")
