@@ -16,5 +16,14 @@ from services.api import (
 )
 
 router = APIRouter(include_in_schema=False)
-for part in (pages_home, pages_jobs, pages_job, pages_grids, pages_benchmarks, pages_subjects, pages_viewer, pages_figures):
+for part in (
+    pages_home,
+    pages_jobs,
+    pages_job,
+    pages_grids,
+    pages_benchmarks,
+    pages_subjects,
+    pages_viewer,
+    pages_figures,
+):
     router.include_router(part.router)
