@@ -85,7 +85,8 @@ def dissimilarity(image: Rendering, target: Tensor) -> Tensor:
     c1, c2 = 0.01**2, 0.03**2
     likeness = (2 * mean_x * mean_y + c1) * (2 * both + c2)
     norm = (mean_x * mean_x + mean_y * mean_y + c1) * (var_x + var_y + c2)
-    return (1 - (likeness / norm).mean()).double()
+    unlike: Tensor = (1 - (likeness / norm).mean()).double()
+    return unlike
 
 
 def _windowed(images: Tensor) -> Tensor:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from rsavatar.bench.study import Column, Study, Variant
 
 PAPERS = {"motion": "frame-spline", "T": "K", "continuity": "aligned"}  # the paper's own model, with our step sizes
 A, B, C = "The paper's model, T = K", "Ours: one spline over the sequence, scanline", "How much of it"
 
-_PAPER_ROWS = (
+_PAPER_ROWS: tuple[tuple[str, dict[str, Any], str], ...] = (
     ("full", {}, "24.65"),
     ("no_rs", {"ablation": {"no_rs": True}}, "23.08 (−1.57)"),
     ("no_spline", {"ablation": {"no_spline": True}}, "21.41 (−3.24)"),
@@ -19,7 +21,7 @@ _PAPER_ROWS = (
     ("T=scanline", {"T": "scanline"}, ""),
     ("L_reg as in the paper's formula", {"continuity": "paper"}, ""),
 )
-_OWN_ROWS = (
+_OWN_ROWS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("ours", {}),
     ("ours, no_rs", {"ablation": {"no_rs": True}}),
     ("ours, no_spline", {"ablation": {"no_spline": True}}),
@@ -31,7 +33,7 @@ _OWN_ROWS = (
     ("ours, residual added as in the paper", {"residual": "additive"}),
     ("ours, the authors' step sizes", {"regime": "authors"}),
 )
-_AMOUNTS = (
+_AMOUNTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("P=4, lambda=1", {}),
     ("P=2", {"P": 2}),
     ("P=3", {"P": 3}),
