@@ -135,7 +135,7 @@ class JobSpec(BaseModel):
         None, ge=0, le=1000, description="exposure of a row in source frames; none = the subject's own; 0 = ignored"
     )
     exposure_samples: int = Field(4, ge=1, le=64, description="scans that an exposure is the mean of")
-    doubt: bool = Field(True, description="leave out training images that contradict all others")
+    doubt: bool = Field(False, description="leave out training images that contradict all others")
     disturb: Disturbance = Field(Disturbance(), description="what is given otherwise, as an experiment")
 
     @model_validator(mode="after")

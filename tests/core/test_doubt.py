@@ -72,7 +72,7 @@ def test_training_leaves_a_wrong_image_out_and_says_which(tmp_path: Path) -> Non
 
     case = replace(case, subject=replace(case.subject, observe=observe))
     method = RollingShutterAvatar()
-    how = replace(settings(case), density=None, doubt_after=100)
+    how = replace(settings(case), density=None, doubt=True, doubt_after=100)
     saver = Saver(tmp_path / "c.safetensors", Owner("a", "b", "c", "d"))
     done = fit(build_actor(method, case), observations(method, case), how, saver, lambda _: None, lambda: False)
     assert done.doubted == ("01/000001",)

@@ -105,7 +105,7 @@ def test_the_hash_ignores_how_a_job_runs_and_nothing_else() -> None:
         "preset": "smoke", "body": "anny", "motion": "frame-spline",
         "regime": "authors", "continuity": "paper", "perturbation": "positive", "sh_degree": 0,
         "mask_weight": 0.25, "densify": False, "checkpoint_every": 7, "ablation": {"no_rs": True},
-        "calibrate": ["readout"], "exposure_samples": 2, "doubt": False, "disturb": {"masks": 0.1},
+        "calibrate": ["readout"], "exposure_samples": 2, "doubt": True, "disturb": {"masks": 0.1},
         "exposure_frames": 0.0, "ssim_weight": 0.2, "residual": "additive", "knots": 2, "skip": ["body"],
         "blur_triggers": True,
     }  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 from rsavatar.bench.study import Column, Study, Variant
 
 FIT, MISSING, MASKS = {"fit": 2.0}, {"missing": 0.25}, {"masks": 0.15}
+ALL = {"disturb": {**FIT, **MISSING, **MASKS}, "doubt": True}
 
 STUDY = Study(
     name="robustness",
@@ -16,14 +17,14 @@ the person, or is three frames late; the image is cut by it as any other. Images
 median of their camera's are left out (`doubt`); the last column counts them.""",
     variants=(
         Variant("as given", {}),
-        Variant("as given, nothing doubted", {"doubt": False}),
+        Variant("as given, doubted", {"doubt": True}),
         Variant("fits twice as wrong", {"disturb": FIT}),
         Variant("a quarter of the images missing", {"disturb": MISSING}),
-        Variant("wrong masks, all believed", {"disturb": MASKS, "doubt": False}),
-        Variant("wrong masks, doubted", {"disturb": MASKS}),
-        Variant("all three", {"disturb": {**FIT, **MISSING, **MASKS}}),
+        Variant("wrong masks, all believed", {"disturb": MASKS}),
+        Variant("wrong masks, doubted", {"disturb": MASKS, "doubt": True}),
+        Variant("all three, doubted", ALL),
         Variant("GauHuman, as given", {"method": "gauhuman"}),
-        Variant("GauHuman, all three", {"method": "gauhuman", "disturb": {**FIT, **MISSING, **MASKS}}),
+        Variant("GauHuman, all three, doubted", {"method": "gauhuman", **ALL}),
     ),
     columns=(
         Column("psnr", "PSNR ↑"),
