@@ -89,7 +89,13 @@ def test_a_resumed_run_ends_like_an_undisturbed_one(tmp_path: Path) -> None:
 
 def test_calibration_and_doubt_are_resumed_too(tmp_path: Path) -> None:
     (tmp_path / "whole").mkdir()
-    words = {"calibrate": ["readout", "trigger"], "doubt": True, "doubt_after": 50, "doubt_from": 0.0, "ssim_weight": 0.1}
+    words = {
+        "calibrate": ["readout", "trigger"],
+        "doubt": True,
+        "doubt_after": 50,
+        "doubt_from": 0.0,
+        "ssim_weight": 0.1,
+    }
     _, _, whole = train(tmp_path / "whole", RollingShutterAvatar(), **words)
     with pytest.raises(Interrupted):
         train(tmp_path, RollingShutterAvatar(), stop_after=75, **words)
