@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -35,7 +36,7 @@ def train(
 
     ``changes`` are of the settings; ``calibrate`` is of the spec.
     """
-    words = {"calibrate": changes.pop("calibrate", [])}
+    words: dict[str, Any] = {"calibrate": changes.pop("calibrate", [])}
     case = small_subject.case(iterations=150, checkpoint_every=1000, **words)
     how = replace(settings(case), density=DENSITY, sh_from=60, **changes)  # type: ignore[arg-type]
     actor, events = build_actor(method, case), list[Event]()
