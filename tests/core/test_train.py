@@ -90,7 +90,7 @@ def test_a_resumed_run_ends_like_an_undisturbed_one(tmp_path: Path) -> None:
 
 def test_calibration_and_doubt_are_resumed_too(tmp_path: Path) -> None:
     (tmp_path / "whole").mkdir()
-    words = {
+    words: dict[str, Any] = {
         "calibrate": ["readout", "trigger"],
         "doubt": True,
         "doubt_after": 50,
