@@ -60,7 +60,7 @@ def fit(
 
     One observation a step, each once an epoch in a new order. Every random choice is a function of the seed and the
     step, so a run resumed from a checkpoint ends bit-identical to one that was never disturbed. Skinning weights are
-    refreshed, Gaussians come and go, images that contradict all others are left out, and checkpoints are written
+    refreshed, Gaussians come and go, images are doubted where that is asked for, and checkpoints are written
     between blocks of steps.
 
     Raises:
