@@ -63,6 +63,7 @@ class Settings:
     checkpoint_every: int
     density: DensityRules | None
     rates: Rates = field(default_factory=Rates)
+    paint: bool = False  # give the Gaussians first colours from the pictures
     sh_from: int = 1000  # step at which the colours' linear harmonics start
     ssim_weight: float = 0.0
     skip: frozenset[Skip] = frozenset(SKIPS)

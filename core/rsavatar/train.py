@@ -19,6 +19,7 @@ from rsavatar.geometry.cameras import Camera
 from rsavatar.imaging import Actor, Schedule, expose
 from rsavatar.losses import dissimilarity, l1
 from rsavatar.optimization import BLOCK, Saver, Settings, SkinBlock, State
+from rsavatar.painting import paint
 from rsavatar.render.base import Rendering
 from rsavatar.skipping import Work
 
@@ -68,6 +69,8 @@ def fit(
             Gaussians are left. The last good checkpoint is kept.
         Interrupted: if ``should_stop`` asked for it; the checkpoint is on disk.
     """
+    if settings.paint and not saver.path.exists():
+        paint(actor, observations)
     state = saver.restore(actor, settings, len(observations))
     gc.freeze()  # what is alive now lives to the end: the collector need not walk it again and again
     begun = time.perf_counter() - state.seconds

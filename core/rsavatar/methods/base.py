@@ -228,6 +228,7 @@ def settings(case: Case) -> Settings:
         checkpoint_every=spec.checkpoint_every,
         density=(DensityRules() if authors else DensityRules(gradient=4e-4)) if spec.densify else None,
         rates=Rates() if authors else POSE_FIRST,
+        paint=not authors,
         doubt=spec.doubt,
         skip=frozenset(spec.skip),
     )
