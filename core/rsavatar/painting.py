@@ -33,7 +33,7 @@ def paint(actor: Actor, observations: Sequence[Observation]) -> None:
     for seen in observations[:: -(-len(observations) // PICTURES)]:
         scene = actor.scene(seen.frame, seen.camera, actor.timed(seen.schedule), weights, 0)
         for total, picture in ((colour, seen.rgb), (covered, seen.mask.expand_as(seen.rgb))):
-            total += torch.autograd.grad(expose(scene).rgb, avatar.sh_constant, picture / 255, retain_graph=True)[0]
+            total.add_(torch.autograd.grad(expose(scene).rgb, avatar.sh_constant, picture / 255, retain_graph=True)[0])
     avatar.opacity_logits.data = thin
     if covered.any():  # else the fit puts nobody where the masks are, and the Gaussians stay grey
         mean = colour.sum(-1, keepdim=True) / covered.sum(-1, keepdim=True)

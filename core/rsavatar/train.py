@@ -69,9 +69,7 @@ def fit(
             Gaussians are left. The last good checkpoint is kept.
         Interrupted: if ``should_stop`` asked for it; the checkpoint is on disk.
     """
-    if settings.paint and not saver.path.exists():
-        paint(actor, observations)
-    state = saver.restore(actor, settings, len(observations))
+    state = _begin(actor, observations, settings, saver)
     gc.freeze()  # what is alive now lives to the end: the collector need not walk it again and again
     begun = time.perf_counter() - state.seconds
     skin, chosen, work = SkinBlock(actor), _chosen(state, settings), Work()
@@ -117,6 +115,13 @@ def fit(
             skin = SkinBlock(actor)
     doubted = tuple(seen.label for seen, bad in zip(observations, state.doubt.doubted.tolist(), strict=True) if bad)
     return Trained(state.seconds, state.rejected, saver.path, doubted)
+
+
+def _begin(actor: Actor, observations: Sequence[Observation], settings: Settings, saver: Saver) -> State:
+    """The checkpoint's state, or that of a new run, whose Gaussians take their first colours from the pictures."""
+    if settings.paint and not saver.path.exists():
+        paint(actor, observations)
+    return saver.restore(actor, settings, len(observations))
 
 
 def pick(seed: int, step: int, count: int) -> int:

@@ -27,7 +27,7 @@ from rsavatar.checkpoint import Owner
 from rsavatar.data.base import Subject
 from rsavatar.data.catalogue import open_subject
 from rsavatar.evaluate import render_view, unit
-from rsavatar.events import Event, Progress
+from rsavatar.events import Event, Progress, silent
 from rsavatar.imaging import Actor
 from rsavatar.methods.base import AbstractMethod, Case, build_actor, observations, settings
 from rsavatar.metrics.image import dilate, psnr
@@ -113,8 +113,8 @@ class Watch:
 def curve(name: str, subject: Subject, preset: str = "draft") -> TrainingCurve:
     """Train ``name`` on ``subject`` and watch it."""
     spec = resolve({"method": name, "subject": subject.name, "preset": preset})
-    case = Case(spec, subject, find_body(spec.body, subject)[0])
     method: AbstractMethod = catalog.load(catalog.METHODS, name)()
+    case = method.prepare(Case(spec, subject, find_body(spec.body, subject)[0]), silent, lambda: False).case
     actor = build_actor(method, case)
     watch = Watch(actor, subject)
     with tempfile.TemporaryDirectory() as folder:
