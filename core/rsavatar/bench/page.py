@@ -58,8 +58,7 @@ REASONS = {  # why a target is missed, by how its name starts
     "20 000 steps": MILLISECONDS,
     "scanline at 50": "What is left is depth order: of splats closer in depth than float32 resolves, and of a strip's "
     "rows, which share one order. See the range over seeds, the pixels off, and the row with strips of 4 rows.",
-    "scanline at 200": "A strip's rows share one depth order: see the "
-    "row with strips of 4 rows. With an order for each row it is 77 dB.",
+    "scanline at 200": "A strip's rows share one depth order: see the rows with other strips and what they cost.",
     "training step, the paper": "What is not rendering (poses, networks, loss, optimiser) costs both ways the same. A "
     "busy machine moves this ratio, too.",
     "peak memory, bands": "Every band keeps its lists, and sums of its own of the gradient of its pose.",

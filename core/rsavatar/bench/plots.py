@@ -17,6 +17,7 @@ STEPS: dict[str, tuple[str, tuple[int, int], str]] = {  # of own time: label, it
     "scanline": ("scanline", (-6, 0), "right"),
     "scanline-coarse": ("strips of 16 rows", (7, 2), "left"),
     "scanline-fine": ("strips of 4 rows", (7, -10), "left"),
+    "scanline-row": ("an order for each row", (7, 2), "left"),
 }
 
 
