@@ -24,16 +24,33 @@ class _Parameter(ctypes.Structure):
     )
 
 
-class Adam(torch.optim.Optimizer):
+Moments = dict[str, Tensor]  # step, exp_avg, exp_avg_sq: torch.optim.Adam's names
+
+
+class Adam:
     """Adam (Kingma and Ba, 2015) without weight decay, on float32 parameters of the CPU.
 
-    State and groups are those of ``torch.optim.Adam``, so checkpoints hold the same names. A parameter without a
-    gradient is left alone, and so is its count of steps.
+    Groups are those of ``torch.optim``, whose base class takes a second to import the compiler that it asks to leave it
+    alone. A parameter without a gradient is left alone, and so is its count of steps.
     """
 
     def __init__(self, groups: list[dict[str, Any]], rate: float, epsilon: float = 1e-8) -> None:
-        super().__init__(groups, {"lr": rate})
+        self.param_groups = [{"lr": rate, **group} for group in groups]
+        self.state: dict[torch.nn.Parameter, Moments] = {}
         self._epsilon = epsilon
+
+    @property
+    def moments(self) -> dict[int, Moments]:
+        """What is known of each parameter that has moved, by its place in the groups."""
+        return {i: self.state[p] for i, p in enumerate(self._parameters()) if p in self.state}
+
+    @moments.setter
+    def moments(self, saved: dict[int, Moments]) -> None:
+        parameters = self._parameters()
+        self.state = {parameters[i]: moments for i, moments in saved.items()}
+
+    def _parameters(self) -> list[torch.nn.Parameter]:
+        return [parameter for group in self.param_groups for parameter in group["params"]]
 
     def advance(self, *watched: Tensor) -> bool:
         """Take a step, or none: False where a gradient, or a tensor of ``watched``, holds NaN or infinity.
@@ -50,18 +67,16 @@ class Adam(torch.optim.Optimizer):
 
     def forget(self) -> None:
         """Drop the gradients; torch's ``zero_grad`` takes half a millisecond for that."""
-        for group in self.param_groups:
-            for parameter in group["params"]:
-                parameter.grad = None
+        for parameter in self._parameters():
+            parameter.grad = None
 
-    def _state_of(self, parameter: Tensor) -> dict[str, Tensor]:
-        state: dict[str, Tensor] = self.state[parameter]
-        if not state:
-            state["step"] = torch.zeros(())
-            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        return state
+    def _state_of(self, parameter: torch.nn.Parameter) -> Moments:
+        if parameter not in self.state:
+            still = {name: torch.zeros_like(parameter.data) for name in ("exp_avg", "exp_avg_sq")}
+            self.state[parameter] = {"step": torch.zeros(()), **still}
+        return self.state[parameter]
 
-    def _native(self, moving: list[tuple[Tensor, float, dict[str, Tensor]]], watched: tuple[Tensor, ...]) -> bool:
+    def _native(self, moving: list[tuple[Tensor, float, Moments]], watched: tuple[Tensor, ...]) -> bool:
         gradients = [p.grad.contiguous() for p, _, _ in moving if p.grad is not None]
         rows = [_Parameter(w.numel(), None, None, None, w.data_ptr(), 0.0, 0) for w in watched]
         for (parameter, rate, state), gradient in zip(moving, gradients, strict=True):
@@ -73,7 +88,7 @@ class Adam(torch.optim.Optimizer):
             raise KernelError(expected("Adam's step", "memory for its plan", "out of memory"))
         return bool(code == 0)
 
-    def _slow(self, moving: list[tuple[Tensor, float, dict[str, Tensor]]], watched: tuple[Tensor, ...]) -> bool:
+    def _slow(self, moving: list[tuple[Tensor, float, Moments]], watched: tuple[Tensor, ...]) -> bool:
         gradients = [p.grad for p, _, _ in moving if p.grad is not None]
         if not all(bool(torch.isfinite(t).all()) for t in (*gradients, *watched)):
             return False

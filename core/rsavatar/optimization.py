@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rsavatar import checkpoint
-from rsavatar.adam import Adam
+from rsavatar.adam import Adam, Moments
 from rsavatar.avatar.density import DensityRules, Edit, ScreenGradients
 from rsavatar.doubt import Doubt
 from rsavatar.errors import DivergedError, expected
@@ -242,7 +242,7 @@ class Saver:
         """Write everything that the next step depends on."""
         tensors = {f"actor.{name}": t for name, t in actor.state_dict().items()}
         for prefix, optimizer in (("adam", state.optimizer), ("skin_adam", state.skin_optimizer)):
-            for i, moments in optimizer.state_dict()["state"].items():
+            for i, moments in optimizer.moments.items():
                 tensors |= {f"{prefix}.{i}.{key}": value for key, value in moments.items()}
         tensors |= {"gradients.total": state.gradients.total, "gradients.seen": state.gradients.seen}
         tensors |= {"doubt.losses": state.doubt.losses, "doubt.doubted": state.doubt.doubted}
@@ -263,12 +263,12 @@ class Saver:
         load_actor(actor, tensors)
         state = State(actor, settings, images)
         for prefix, optimizer in (("adam", state.optimizer), ("skin_adam", state.skin_optimizer)):
-            saved = optimizer.state_dict()
+            saved: dict[int, Moments] = {}
             for name, value in tensors.items():
                 if name.startswith(prefix + "."):
                     _, i, key = name.split(".")
-                    saved["state"].setdefault(int(i), {})[key] = value
-            optimizer.load_state_dict(saved)
+                    saved.setdefault(int(i), {})[key] = value
+            optimizer.moments = saved
         state.gradients.total, state.gradients.seen = tensors["gradients.total"], tensors["gradients.seen"]
         state.doubt.losses, state.doubt.doubted = tensors["doubt.losses"], tensors["doubt.doubted"]
         state.nodes.needed, state.nodes.visits = tensors["nodes.needed"], tensors["nodes.visits"]

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import torch
@@ -44,10 +45,12 @@ class Nodes:
         self.visits = torch.zeros(images, dtype=torch.int64)
         self._thinned: dict[tuple[int, int], Schedule] = {}
 
+    def _looks(self, index: int) -> bool:
+        return int(self.visits[index]) % LOOK_EVERY == 0
+
     def choose(self, index: int, schedule: Schedule) -> Schedule:
         """The schedule of image ``index`` with as many nodes as it needs."""
-        looks = int(self.visits[index]) % LOOK_EVERY == 0
-        nodes = schedule.coefficients if looks else min(int(self.needed[index]), schedule.coefficients)
+        nodes = schedule.coefficients if self._looks(index) else min(int(self.needed[index]), schedule.coefficients)
         if nodes == schedule.coefficients:
             return schedule
         key = index, nodes
@@ -56,8 +59,8 @@ class Nodes:
         return self._thinned[key]
 
     def note(self, index: int, scene: Scene) -> None:
-        """Count a visit; learn from a scene that had all its nodes."""
-        if scene.pose.shape[1] == NODES:
+        """Count a visit; learn from a look that had all its nodes."""
+        if self._looks(index) and scene.pose.shape[1] == NODES:
             self.needed[index] = needed_nodes(scene)
         self.visits[index] += 1
 
@@ -95,6 +98,7 @@ def needed_nodes(scene: Scene) -> int:
     return int(fitting[0]) + 1 if len(fitting) else scene.pose.shape[1]
 
 
+@cache
 def _to_chebyshev(count: int) -> Tensor:
     """[D, D] from monomial to Chebyshev coefficients."""
     columns = [np.polynomial.chebyshev.poly2cheb(np.eye(count)[d]) for d in range(count)]
