@@ -72,6 +72,17 @@ def test_every_so_many_visits_an_image_gets_all_its_nodes() -> None:
     assert nodes.choose(0, bands) is bands
 
 
+def test_nothing_is_looked_for_between_looks() -> None:
+    nodes, still = Nodes(1), moving(1e-4)
+    nodes.note(0, moving(100.0))
+    fast = int(nodes.needed[0])
+    for _ in range(LOOK_EVERY - 1):
+        nodes.note(0, still)
+        assert nodes.needed[0] == fast > 1
+    nodes.note(0, still)
+    assert nodes.needed[0] == 1
+
+
 def test_images_that_no_longer_change_rest_every_second_block() -> None:
     settled = Settled(4)
     for loss in (1.0, 1.001, 1.0, 1.001):
