@@ -33,7 +33,8 @@ def paint(actor: Actor, observations: Sequence[Observation]) -> None:
     for seen in observations[:: -(-len(observations) // PICTURES)]:
         scene = actor.scene(seen.frame, seen.camera, actor.timed(seen.schedule), weights, 0)
         for total, picture in ((colour, seen.rgb), (covered, seen.mask.expand_as(seen.rgb))):
-            total.add_(torch.autograd.grad(expose(scene).rgb, avatar.sh_constant, picture / 255, retain_graph=True)[0])
+            shown = (expose(scene).rgb * (picture / 255)).sum()
+            total.add_(torch.autograd.grad(shown, avatar.sh_constant, retain_graph=True)[0])
     avatar.opacity_logits.data = thin
     if covered.any():  # else the fit puts nobody where the masks are, and the Gaussians stay grey
         mean = colour.sum(-1, keepdim=True) / covered.sum(-1, keepdim=True)
