@@ -176,6 +176,7 @@ def _add_remote(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     submit = _add(verbs, "submit", "rsavatar.cli_remote:submit", "queue a job", SUBMIT)
     _add_request(submit)
     submit.add_argument("--key", help="idempotency key (default: a fresh one)")
+    submit.add_argument("--force", action="store_true", help="run it even if its result is known")
     submit.add_argument("--watch", action="store_true", help="stay and follow it")
 
     _add_id(_add(verbs, "watch", "rsavatar.cli_remote:watch", "follow a job until it ends", WATCH))
@@ -237,6 +238,7 @@ def _add_grid(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> arg
     grid.add_argument("--subjects", metavar="A,B", help="on these subjects")
     grid.add_argument("--dry-run", action="store_true", help="how many jobs, how long; queue nothing")
     grid.add_argument("--key", help="idempotency key (default: a fresh one)")
+    grid.add_argument("--force", action="store_true", help="run jobs even if their results are known")
     grid.add_argument("--watch", action="store_true", help="stay and follow it")
     verb = grid.add_mutually_exclusive_group()
     for name, about in (("cancel", "stop"), ("pause", "hold"), ("resume", "go on with"), ("retry", "queue again")):

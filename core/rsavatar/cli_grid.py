@@ -80,7 +80,7 @@ def _submit(client: Client, arguments: argparse.Namespace) -> int:
     if arguments.dry_run:
         _print_plan(client.plan_grid(body))
         return 0
-    found = client.submit_grid(body, arguments.key)
+    found = client.submit_grid(body, arguments.key, arguments.force)
     print(found["id"], flush=True)
     if not arguments.watch:
         print(f"{found['jobs']} jobs; follow them with: rsavatar grid {found['id']} --watch", file=sys.stderr)

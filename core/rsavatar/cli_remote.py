@@ -17,7 +17,7 @@ def submit(arguments: argparse.Namespace) -> int:
     """``rsavatar submit``: queue a job and print its id."""
     request = read_request(arguments.spec, arguments.set)
     with Client(arguments.url) as client:
-        job = client.submit(request, arguments.key)
+        job = client.submit(request, arguments.key, arguments.force)
         print(job["id"], flush=True)
         return _follow(client, job["id"]) if arguments.watch else 0
 

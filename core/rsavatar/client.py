@@ -69,11 +69,12 @@ class Client:
         """Give the connections back."""
         self._http.close()
 
-    def submit(self, request: Mapping[str, Any], idempotency_key: str | None = None) -> Json:
-        """Queue a job; the same key and request give the same job. Returns the job."""
-        headers = {"Idempotency-Key": idempotency_key or str(uuid.uuid4())}
-        job: Json = self._json("POST", "/jobs", json=dict(request), headers=headers)
-        return job
+    def submit(self, request: Mapping[str, Any], idempotency_key: str | None = None, force: bool = False) -> Json:
+        """Queue a job; the same key and request give the same job. Returns the job.
+
+        With ``force`` it runs even where its result is known.
+        """
+        return self._queue("/jobs", request, idempotency_key, force)
 
     def job(self, job_id: str) -> Json:
         """One job."""
@@ -122,11 +123,12 @@ class Client:
         place = _path("jobs", job_id, "export", kind)
         return self._request("GET", place, params=options, timeout=DRAWING_SECONDS).content
 
-    def submit_grid(self, request: Mapping[str, Any], idempotency_key: str | None = None) -> Json:
-        """Queue all jobs of a grid; the same key and request give the same grid. Returns the grid."""
-        headers = {"Idempotency-Key": idempotency_key or str(uuid.uuid4())}
-        found: Json = self._json("POST", "/grids", json=dict(request), headers=headers)
-        return found
+    def submit_grid(self, request: Mapping[str, Any], idempotency_key: str | None = None, force: bool = False) -> Json:
+        """Queue all jobs of a grid; the same key and request give the same grid. Returns the grid.
+
+        With ``force`` jobs run even where their results are known.
+        """
+        return self._queue("/grids", request, idempotency_key, force)
 
     def plan_grid(self, request: Mapping[str, Any]) -> Json:
         """What a grid would do: its jobs, known results, time. Nothing is queued."""
@@ -236,6 +238,11 @@ class Client:
                 yield from parse_events(response.iter_lines())
             except ValueError as error:
                 raise self._stranger(f"events that are not JSON: {error}", 200) from None
+
+    def _queue(self, path: str, request: Mapping[str, Any], key: str | None, force: bool) -> Json:
+        headers, asked = {"Idempotency-Key": key or str(uuid.uuid4())}, {"force": "true"} if force else {}
+        found: Json = self._json("POST", path, json=dict(request), headers=headers, params=asked)
+        return found
 
     def _json(self, method: str, path: str, **options: Any) -> Any:
         response = self._request(method, path, **options)

@@ -241,6 +241,12 @@ def test_the_verbs_of_the_service_end_to_end(service: Service, say: Any, tmp_pat
     assert "| GauHuman | 23.46 |" in say("table", "main")[1]
     assert json.loads(say("table", "per-subject", "--format", "json")[1])["rows"][0]["method"] == "gauhuman"
 
+    known = say("submit", "smoke", "--set", "method=gauhuman", "--set", "subject=studio")[1].strip()
+    forced = say("submit", "smoke", "--set", "method=gauhuman", "--set", "subject=studio", "--force")[1].strip()
+    assert f"{known}  succeeded" in say("jobs")[1]
+    assert f"{forced}  queued" in say("jobs")[1]
+    say("cancel", forced)
+
 
 def test_a_failed_job_is_listed_with_its_reason(service: Service, say: Any) -> None:
     job_id = say("submit", "smoke", "--set", "method=mad-avatar", "--set", "subject=studio")[1].strip()
