@@ -165,13 +165,13 @@ def _broken_parameter() -> Measured:
     method = RollingShutterAvatar()
     job = small(iterations=100)
     actor = build_actor(method, job)
-    actor.avatar.sh_constant.data[0, 0, 5] = math.nan
+    actor.avatar.log_scales.data[0, 5] = math.nan
     with tempfile.TemporaryDirectory() as folder:
         saver = Saver(Path(folder) / "checkpoint.safetensors", OWNER)
         try:
             fit(actor, observations(method, job), settings(job), saver, lambda _: None, lambda: False)
         except DivergedError as error:
-            return f"DivergedError: {error}", "sh_constant" in str(error) and not saver.path.exists()
+            return f"DivergedError: {error}", "log_scales" in str(error) and not saver.path.exists()
     return "no error", False
 
 
