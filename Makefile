@@ -26,7 +26,7 @@ setup: $(SETUP)
 $(SETUP): pyproject.toml setup.py $(wildcard core/native/*)
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and f"python: expected 3.11 or newer, got {v[0]}.{v[1]} (set PYTHON=...)")'
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	touch $@
 
 demo: $(SETUP)
