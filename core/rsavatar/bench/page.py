@@ -62,7 +62,7 @@ REASONS = {  # why a target is missed, by how its name starts
     "training step, the paper": "What is not rendering (poses, networks, loss, optimiser) costs both ways the same. A "
     "busy machine moves this ratio, too.",
     "memory, last training step": "Most of it comes before step 500; a leak would grow evenly. "
-    "Scratch grows to the most crowded strip seen.",
+    "The cause was not found.",
     "peak memory, bands": "Every band keeps its lists, and sums of its own of the gradient of its pose.",
     "torch twin": "Measured once; a busy machine moves it.",
 }
