@@ -1,7 +1,7 @@
 """``rsavatar bench train``: held-out PSNR against the seconds of training, for each method at one budget.
 
-Trains ``--preset`` on each of ``--subjects``, or on the built-in one. Looking at the held-out views is not counted
-as training, and changes no number of it.
+Trains ``--preset`` on each of ``--subjects``, or on the built-in one. What a method prepares before its first step is
+counted as training; looking at the held-out views is not, and changes no number of it.
 """
 
 from __future__ import annotations
@@ -73,10 +73,10 @@ class TrainResult(_Record):
 
 
 class Watch:
-    """Follows one training run and keeps its own time out of the account."""
+    """Follows one training run, which ``prepared`` for some seconds, and keeps its own time out of the account."""
 
-    def __init__(self, actor: Actor, subject: Subject) -> None:
-        self.actor, self.subject = actor, subject
+    def __init__(self, actor: Actor, subject: Subject, prepared: float) -> None:
+        self.actor, self.subject, self.prepared = actor, subject, prepared
         frames = np.linspace(0, subject.frames - 1, min(VIEWS_PER_CAMERA, subject.frames)).round().astype(int)
         self.views = [(camera, int(frame)) for camera in subject.held_out for frame in sorted(set(frames.tolist()))]
         self.seconds: list[float] = []
@@ -88,7 +88,7 @@ class Watch:
         """Look now and then, and at the end."""
         if not isinstance(event, Progress):
             return
-        trained = event.seconds - self.looking
+        trained = self.prepared + event.seconds - self.looking
         due = not self.seconds or trained - self.seconds[-1] >= LOOK_SECONDS or event.step == event.steps
         if due:
             begun = time.perf_counter()
@@ -112,11 +112,12 @@ class Watch:
 
 def curve(name: str, subject: Subject, preset: str = "draft") -> TrainingCurve:
     """Train ``name`` on ``subject`` and watch it."""
+    begun = time.perf_counter()
     spec = resolve({"method": name, "subject": subject.name, "preset": preset})
     method: AbstractMethod = catalog.load(catalog.METHODS, name)()
     case = method.prepare(Case(spec, subject, find_body(spec.body, subject)[0]), silent, lambda: False).case
     actor = build_actor(method, case)
-    watch = Watch(actor, subject)
+    watch = Watch(actor, subject, time.perf_counter() - begun)
     with tempfile.TemporaryDirectory() as folder:
         owner = Owner(spec.sha256(), subject.fingerprint, case.body.sha256, __version__)
         saver = Saver(Path(folder) / "checkpoint.safetensors", owner)
@@ -161,7 +162,7 @@ def page(result: TrainResult, stem: str = "train") -> str:
         "# Training: held-out PSNR against seconds",
         "",
         f"Written by `{result.command}`, preset {result.preset}, seed 0; the JSON file beside it holds the curves."
-        " Looking at the held-out views is not counted. Seconds are of the processor named here and grow when it is"
+        " Preparation counts, looking at the held-out views does not. Seconds are of the processor named here and grow when it is"
         " busy; who is above whom carries over.",
         "",
         f"Commit {machine.commit}; {machine.processor}, {machine.cores} cores, {machine.threads} kernel threads,"
