@@ -10,7 +10,7 @@ import sys
 
 from services.errors import ServiceError
 from services.settings import make_home, read_settings
-from services.store import garbage, schema, stages
+from services.store import garbage, schema
 from services.store.session import Store
 
 
@@ -32,14 +32,13 @@ def main() -> int:
         schema.require_head(store)
         grace = settings.gc_grace_seconds if options.grace is None else options.grace
         found = garbage.collect(store, settings.home / "jobs", grace, dry_run=options.dry_run)
-        old = stages.collect(store, 24 * 3600.0 * settings.stage_days, dry_run=options.dry_run)
         store.close()
     except ServiceError as error:
         print(error, file=sys.stderr)
         return 1
     verb = "would remove" if options.dry_run else "removed"
     print(f"{verb} {found.blobs} blobs ({found.bytes / 2**20:.1f} MB), {found.strays} unfinished files,")
-    print(f"{found.folders} folders of jobs that do not exist, {len(old)} shared stages not used for long")
+    print(f"{found.folders} folders of jobs that do not exist")
     for sha256 in found.missing:
         print(f"missing: the bytes of {sha256} are named but gone")
     return 0

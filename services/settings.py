@@ -82,7 +82,6 @@ class Settings(BaseSettings):
     )
     gc_hours: float = Field(default=1.0, ge=0, description="hours between two collections of unnamed bytes; 0 = never")
     gc_grace_seconds: float = Field(default=3600.0, ge=0, description="age before which unnamed bytes are left alone")
-    stage_days: float = Field(default=30.0, ge=0, description="rest after which shared work is forgotten")
     child_command: tuple[str, ...] = Field(
         default=(sys.executable, "-m", "services.worker.child"),
         description="the process that trains",

@@ -43,12 +43,13 @@ from services.api.gate import Gate
 from services.api.guard import Guard
 from services.api.intake import Intake
 from services.api.trail import Trail, latencies, routes_by_endpoint
-from services.settings import Settings
-from services.store import schema
+from services.settings import ROOT, Settings
+from services.store import benchmarks, schema
 from services.store.session import Store
 
 PREFIX = "/api/v1"
 STATIC = Path(__file__).parent / "static"
+SHIPPED = ROOT / "docs" / "benchmarks"
 NOUNS = (
     jobs,
     labels,
@@ -77,6 +78,7 @@ def create_app(settings: Settings) -> FastAPI:
     store = Store(settings)
     schema.require_head(store)
     subjects.discover(store, settings.subject_roots)
+    benchmarks.discover(store, SHIPPED)
     uploads.remove_leftovers(settings, store)
 
     drawings = Drawings(settings)

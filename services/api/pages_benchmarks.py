@@ -1,4 +1,4 @@
-"""Benchmarks: what was measured, on which commit and machine, shipped with the code or stored by the service."""
+"""Benchmarks: what was measured, on which commit and machine. What ships with the code is stored at the start."""
 
 from __future__ import annotations
 
@@ -13,11 +13,9 @@ from fastapi.responses import HTMLResponse
 from services.api import vendor
 from services.api.deps import Back
 from services.api.layout import PageRoute, page
-from services.settings import ROOT
 from services.store import benchmarks
 from services.store.session import Store
 
-SHIPPED = ROOT / "docs" / "benchmarks"
 ORDER = ("render", "growth", "train", "stability")
 TITLES = {
     "render": "Run time against error",
@@ -25,20 +23,18 @@ TITLES = {
     "train": "Quality against time",
     "stability": "Stability",
 }
-LARGEST = 8 << 20  # bytes of a result that is read
 
 router = APIRouter(route_class=PageRoute, prefix="/benchmarks")
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """One run of a benchmark. ``stored`` is its id in the database, none for one that came with the code."""
+    """One run of a benchmark."""
 
     kind: str
     commit: str
     machine: Mapping[str, Any]
     payload: Mapping[str, Any]
-    stored: str | None = None
 
     @property
     def title(self) -> str:
@@ -56,7 +52,7 @@ def benchmarks_page(
     request: Request, back: Back, commit: Annotated[str | None, Query(pattern=r"^[0-9a-z-]{0,64}$")] = None
 ) -> HTMLResponse:
     """The newest run of every benchmark, or those of a commit; earlier runs show whether something got slower."""
-    everything = [*shipped(), *stored(back.store)]
+    everything = stored(back.store)
     commits = list(dict.fromkeys(m.commit for m in reversed(everything)))
     wanted = [m for m in everything if not commit or m.commit == commit]
     chosen = {m.kind: m for m in wanted}  # the newest of a kind comes last
@@ -73,29 +69,9 @@ def benchmarks_page(
     return page(request, "benchmarks.html", context, charts=True)
 
 
-def shipped() -> list[Measurement]:
-    """Results that lie in the checkout; a file that is no result is left out."""
-    found = []
-    for path in sorted(SHIPPED.glob("*.json")) if SHIPPED.is_dir() else []:
-        if path.stat().st_size > LARGEST:
-            continue
-        try:
-            payload = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError:
-            continue
-        if isinstance(payload, dict) and isinstance(payload.get("machine"), dict):
-            found.append(_measurement(str(payload.get("kind", path.stem)), payload, None))
-    return found
-
-
 def stored(store: Store) -> list[Measurement]:
     """Results in the database, oldest first."""
-    return [_measurement(b.name, b.payload, b.id) for b in benchmarks.newest(store)]
-
-
-def _measurement(kind: str, payload: Mapping[str, Any], stored_id: str | None) -> Measurement:
-    machine = payload.get("machine") or {}
-    return Measurement(kind, str(machine.get("commit", "unknown")), machine, payload, stored_id)
+    return [Measurement(b.name, b.commit, b.machine, b.payload) for b in benchmarks.newest(store)]
 
 
 def history(everything: list[Measurement]) -> list[tuple[str, str, list[tuple[str, float]]]]:

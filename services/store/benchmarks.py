@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from sqlalchemy import select
@@ -13,6 +15,7 @@ from services.store.session import Store, db_now
 from services.store.tables import BenchmarkRow
 
 MOST = 200
+LARGEST = 8 << 20  # bytes of a result that is read
 
 
 @dataclass(frozen=True)
@@ -27,11 +30,33 @@ class Benchmark:
     created_at: float
 
 
+def discover(store: Store, folder: Path) -> None:
+    """Keep the results that ``rsavatar bench --json`` has written to ``folder``, each once.
+
+    Those of a later code stand beside those of an earlier one, which its files have replaced. What is no result is
+    left out; NaN, which is not JSON, becomes null.
+    """
+    for path in sorted(folder.glob("*.json")) if folder.is_dir() else []:
+        if path.stat().st_size > LARGEST:
+            continue
+        try:
+            payload = json.loads(path.read_text(encoding="utf-8"), parse_constant=lambda word: None)
+        except ValueError:
+            continue
+        if isinstance(payload, dict) and isinstance(payload.get("machine"), dict):
+            add(store, str(payload.get("kind", path.stem)), payload)
+
+
 def add(store: Store, name: str, payload: Mapping[str, Any]) -> str:
-    """Keep a result as ``rsavatar bench --json`` writes it; returns its id."""
+    """Keep a result; returns its id, or that of the same measurement if it has been kept before."""
     machine = dict(payload.get("machine") or {})
+    commit = str(machine.get("commit", "unknown"))
+    same = (BenchmarkRow.name == name) & (BenchmarkRow.commit == commit)
     with store.write() as session:
-        row = BenchmarkRow(id=new_id(), name=name, commit=str(machine.get("commit", "unknown")), machine=machine)
+        for row in session.scalars(select(BenchmarkRow).where(same)):
+            if row.payload == payload:
+                return row.id
+        row = BenchmarkRow(id=new_id(), name=name, commit=commit, machine=machine)
         row.payload, row.created_at = dict(payload), session.scalar(select(db_now())) or 0.0
         session.add(row)
         return row.id

@@ -13,7 +13,7 @@ from services.store.tables_access import AuditRow, BenchmarkRow, OwnerRow, Token
 # fmt: off
 __all__ = [  # all tables are found here
     "LOCAL", "ArtifactRow", "AuditRow", "Base", "BenchmarkRow", "BlobRow", "CheckpointRow", "EventRow", "GridRow",
-    "JobRow", "OwnerRow", "PointRow", "ResultRow", "SchedulerRow", "ScoreRow", "StageRow", "SubjectRow", "TagRow",
+    "JobRow", "OwnerRow", "PointRow", "ResultRow", "SchedulerRow", "ScoreRow", "SubjectRow", "TagRow",
     "TokenRow",
 ]
 # fmt: on
@@ -199,24 +199,6 @@ class BlobRow(Base):
     size: Mapped[int] = mapped_column(BigInteger)
     created_at: Mapped[float]
     used_at: Mapped[float] = mapped_column(index=True)
-
-
-class StageRow(Base):
-    """Work that many jobs share and one process builds. ``attempt`` fences the builder as it does for jobs."""
-
-    __tablename__ = "stages"
-
-    key: Mapped[str] = mapped_column(String(64), primary_key=True)
-    kind: Mapped[str] = mapped_column(String(32))
-    state: Mapped[str] = mapped_column(String(16))
-    owner: Mapped[str | None] = mapped_column(String(255))
-    lease_until: Mapped[float | None]
-    attempt: Mapped[int] = mapped_column(default=0)
-    path: Mapped[str | None] = mapped_column(Text)
-    size: Mapped[int | None] = mapped_column(BigInteger)
-    created_at: Mapped[float]
-    used_at: Mapped[float]
-    error: Mapped[str | None] = mapped_column(Text)
 
 
 class GridRow(Base):

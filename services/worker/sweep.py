@@ -16,7 +16,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from services import jobs
 from services.process import is_surely_dead
 from services.settings import Settings
-from services.store import garbage, leases, stages
+from services.store import garbage, leases
 from services.store.session import Store
 
 DUTY, COLLECTION = "sweep", "gc"
@@ -48,7 +48,6 @@ def collect(settings: Settings, store: Store, owner: str) -> None:
     if not settings.gc_hours or not leases.take_duty(store, COLLECTION, owner, 3600.0 * settings.gc_hours, renew=False):
         return
     found = garbage.collect(store, settings.home / "jobs", settings.gc_grace_seconds, dry_run=False)
-    stages.collect(store, 24 * 3600.0 * settings.stage_days, dry_run=False)
     if found.blobs:
         log.info("removed %d blobs that nothing names, %.1f MB", found.blobs, found.bytes / 2**20)
     for sha256 in found.missing:

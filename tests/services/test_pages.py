@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import json
 import re
 import zipfile
 from html.parser import HTMLParser
@@ -252,6 +253,20 @@ def test_the_chart_library_comes_from_its_package_and_is_kept(untouched: httpx.C
     assert gzip.decompress(raw) == path.read_bytes()
     assert len(raw) < 2_000_000
     assert untouched.get("/static/vendor/plotly-0.0.1.min.js").status_code == 404
+
+
+def test_results_of_benchmarks_are_kept_once_and_beside_those_of_other_commits(store: Store, tmp_path: Path) -> None:
+    machine = {"commit": "one"}
+    (tmp_path / "speed.json").write_text(json.dumps({"kind": "speed", "machine": machine, "targets": []}))
+    (tmp_path / "broken.json").write_text("{")
+    (tmp_path / "other.json").write_text("[1]")
+    before = {b.id for b in benchmarks.newest(store)}
+    benchmarks.discover(store, tmp_path)
+    benchmarks.discover(store, tmp_path)
+    (tmp_path / "speed.json").write_text(json.dumps({"kind": "speed", "machine": {"commit": "two"}, "targets": []}))
+    benchmarks.discover(store, tmp_path)
+    found = [(b.name, b.commit) for b in benchmarks.newest(store) if b.id not in before]
+    assert found == [("speed", "one"), ("speed", "two")]
 
 
 def test_stored_benchmarks_stand_beside_those_of_the_checkout(client: httpx.Client, store: Store) -> None:

@@ -15,7 +15,7 @@ from moto.server import ThreadedMotoServer
 from rsavatar.spec import resolve
 from services.errors import RequestError, SettingsError
 from services.settings import Settings
-from services.store import artifacts, blobs, content, garbage, jobs, leases, stages, subjects
+from services.store import artifacts, blobs, content, garbage, jobs, leases, subjects
 from services.store.records import Batch, Checkpoint, Outcome
 from services.store.session import Store
 from services.store.subject_records import Subject
@@ -144,27 +144,6 @@ def test_bytes_without_a_row_are_collected_and_rows_without_bytes_are_told(
     found = garbage.collect(store, settings.home / "jobs", OLD, dry_run=False)
     assert (found.blobs, found.missing) == (1, [named.sha256])
     assert store.blobs.path(stranger) is None
-
-
-def test_a_stage_is_built_by_one_and_fenced(store: Store, tmp_path: Path) -> None:
-    first = stages.claim(store, "k" * 64, "restore", "one", 60.0)
-    second = stages.claim(store, "k" * 64, "restore", "two", 60.0)
-    assert (first.is_mine, second.is_mine, second.state) == (True, False, "building")
-    stages.renew(store, first, -1.0)
-    third = stages.claim(store, "k" * 64, "restore", "two", 60.0)
-    assert (third.is_mine, third.attempt) == (True, 2)
-    for late in (lambda: stages.renew(store, first, 60.0), lambda: stages.finish(store, first, tmp_path, 1)):
-        with pytest.raises(stages.FencedError):
-            late()
-    stages.fail(store, third, "no disk")
-    fourth = stages.claim(store, "k" * 64, "restore", "one", 60.0)
-    stages.finish(store, fourth, tmp_path, 7)
-    ready = stages.claim(store, "k" * 64, "restore", "three", 60.0)
-    assert (ready.is_mine, ready.state, ready.path, ready.size) == (False, "ready", str(tmp_path), 7)
-    assert stages.collect(store, 3600.0, dry_run=False) == []
-    assert stages.collect(store, OLD, dry_run=True) == [str(tmp_path)]
-    stages.collect(store, OLD, dry_run=False)
-    assert stages.get(store, "k" * 64) is None
 
 
 def test_a_content_is_its_spec_its_data_and_its_code(

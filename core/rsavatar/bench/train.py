@@ -162,8 +162,8 @@ def page(result: TrainResult, stem: str = "train") -> str:
         "# Training: held-out PSNR against seconds",
         "",
         f"Written by `{result.command}`, preset {result.preset}, seed 0; the JSON file beside it holds the curves."
-        " Preparation counts, looking at the held-out views does not. Seconds are of the processor named here and grow when it is"
-        " busy; who is above whom carries over.",
+        " Preparation counts, looking at the held-out views does not. Seconds are of the processor named here and"
+        " grow when it is busy; who is above whom carries over.",
         "",
         f"Commit {machine.commit}; {machine.processor}, {machine.cores} cores, {machine.threads} kernel threads,"
         f" {machine.instructions}, load {machine.load:g} before.",
