@@ -216,7 +216,7 @@ def test_the_cluster_runs_the_same_programs_with_the_same_limits(
     shared = next(each["data"] for (kind, name), each in found.items() if kind == "ConfigMap" and name == "settings")
     for kind, name in (("Deployment", "api"), ("Deployment", "worker"), ("Job", "migrate")):
         pod = found[kind, name]["spec"]["template"]["spec"]
-        (container,) = pod["containers"]
+        (container,) = (each for each in pod["containers"] if each["name"] != "renderer")
         composed = COMPOSE["services"][name]
         assert container["command"] == composed["command"]
         assert pod["securityContext"]["runAsUser"] == 10001
@@ -226,6 +226,9 @@ def test_the_cluster_runs_the_same_programs_with_the_same_limits(
         assert settings.needs_token or name != "api"
         grace = pod.get("terminationGracePeriodSeconds", 30)
         assert name != "worker" or grace > settings.grace_seconds + 20
+        drawing = [*COMPOSE["services"]["renderer"]["command"][:-1], str(settings.render_socket)]
+        beside = [each["command"] for each in pod["containers"] if each["name"] == "renderer"]
+        assert beside == ([drawing] if name == "api" else [])
 
 
 @pytest.mark.parametrize("overlay", ["single-node", "ha"])
