@@ -85,6 +85,13 @@ examples:
   rsavatar token create laptop --owner ann
   rsavatar token create dashboards --owner monitoring --scope read --days 0
 """
+OWNER = """\
+What is not named is as the service has it for everybody. An owner of share 2 gets twice the workers of one of share 1
+while both have work.
+
+example:
+  rsavatar owner set ann --queued 200 --running 4 --share 2
+"""
 FIGURE = """\
 The service draws it from its database and its avatars; the file's ending says the format.
 
@@ -258,7 +265,14 @@ def _add_access(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> l
     listing = _add(nouns, "list", "rsavatar.cli_access:show", "list tokens, newest first")
     revoke = _add(nouns, "revoke", "rsavatar.cli_access:revoke", "end a token, and the logins that it made, at once")
     revoke.add_argument("token_id", metavar="ID")
-    return [login, create, listing, revoke]
+    nouns = verbs.add_parser("owner", help="limits of who submits jobs").add_subparsers(required=True, metavar="VERB")
+    owners = _add(nouns, "list", "rsavatar.cli_access:show_owners", "list owners and their limits")
+    allow = _add(nouns, "set", "rsavatar.cli_access:put_owner", "set an owner's limits", OWNER)
+    allow.add_argument("name", metavar="NAME", help="as tokens name it")
+    for name, about in (("queued", "wait"), ("running", "run at a time")):
+        allow.add_argument(f"--{name}", type=int, metavar="N", help=f"jobs that may {about} (0: any number)")
+    allow.add_argument("--share", type=float, default=1.0, metavar="X", help="of the workers (default: 1)")
+    return [login, create, listing, revoke, owners, allow]
 
 
 def _add(

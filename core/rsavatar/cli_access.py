@@ -1,4 +1,4 @@
-"""Verbs about who may do what: login, token."""
+"""Verbs about who may do what: login, token, owner."""
 
 from __future__ import annotations
 
@@ -56,6 +56,27 @@ def revoke(arguments: argparse.Namespace) -> int:
         token = client.revoke_token(arguments.token_id)
     print(f"{token['id']}  {token['owner']}  revoked {token['revoked_at'][:16]}")
     return 0
+
+
+def show_owners(arguments: argparse.Namespace) -> int:
+    """``rsavatar owner list``: a line per owner, by name."""
+    with Client(arguments.url) as client:
+        for owner in client.owners():
+            print(_owner_line(owner))
+    return 0
+
+
+def put_owner(arguments: argparse.Namespace) -> int:
+    """``rsavatar owner set``: limits and share of an owner; what is not named becomes the service's own."""
+    with Client(arguments.url) as client:
+        print(_owner_line(client.put_owner(arguments.name, arguments.queued, arguments.running, arguments.share)))
+    return 0
+
+
+def _owner_line(owner: dict[str, Any]) -> str:
+    limits = {None: "as the service", 0: "no limit"}
+    queued, running = (limits.get(owner[key], str(owner[key])) for key in ("max_queued", "max_running"))
+    return f"{owner['name']:<16} waiting: {queued:<15} running: {running:<15} share: {owner['share']:g}"
 
 
 def _line(token: dict[str, Any]) -> str:

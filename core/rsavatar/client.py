@@ -206,6 +206,16 @@ class Client:
         token: Json = self._json("DELETE", _path("tokens", token_id))
         return token
 
+    def owners(self) -> list[Json]:
+        """Everybody who has jobs or limits, with the limits."""
+        return list(self._json("GET", "/owners"))
+
+    def put_owner(self, name: str, max_queued: int | None, max_running: int | None, share: float) -> Json:
+        """Set an owner's limits (none: the service's; 0: no limit) and share of the workers. Returns the owner."""
+        body = {"max_queued": max_queued, "max_running": max_running, "share": share}
+        owner: Json = self._json("PUT", _path("owners", name), json=body)
+        return owner
+
     def events(self, job_id: str, last_event_id: str | None = None) -> Generator[ServerEvent, None, None]:
         """Events of a job, from the beginning or after ``last_event_id``, until the job has ended.
 

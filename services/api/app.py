@@ -27,11 +27,13 @@ from services.api import (
     jobs,
     labels,
     login,
+    owners,
     pages,
     problems,
     render,
     subjects,
     tables,
+    threads,
     tokens,
     uploads,
     vendor,
@@ -62,6 +64,7 @@ NOUNS = (
     subjects,
     tables,
     tokens,
+    owners,
     audit,
     render,
     figures,
@@ -85,6 +88,7 @@ def create_app(settings: Settings) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        threads.limit()
         yield
         drawings.close()
         store.close()

@@ -16,6 +16,7 @@ from rsavatar.report.runs import Figure, Run, Wish, of_preset, standard
 from rsavatar.spec import Preset, resolve
 from services.api.deps import Back, Backend
 from services.api.sources import source_of
+from services.api.threads import waiting
 from services.errors import NotFoundError
 from services.store import curves, metrics
 from services.store.records import TableEntry
@@ -46,6 +47,7 @@ class FigureQuery(BaseModel):
 
 
 @router.get("/{name}.{format}", response_class=Response)
+@waiting
 def get_figure(
     name: str,
     format: Format,

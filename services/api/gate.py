@@ -90,8 +90,11 @@ def credential_of(headers: Headers) -> Credential | None:
     kind, _, secret = headers.get("authorization", "").partition(" ")
     if kind.lower() == "bearer":
         return Credential(secret.strip(), by_cookie=False)
+    cookies = headers.get("cookie", "")
+    if COOKIE not in cookies:
+        return None
     try:
-        cookie = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
+        cookie = SimpleCookie(cookies).get(COOKIE)
     except CookieError:
         return None
     return None if cookie is None else Credential(cookie.value, by_cookie=True)

@@ -62,14 +62,13 @@ def list_jobs(query: Annotated[JobQuery, Query()], back: Back) -> Response:
     found = listing.lines(back.store, filters, order, query.cursor, query.limit + 1)
     shown = found[: query.limit]
     next_cursor = None if len(found) <= query.limit else str(shown[-1]["id"])
-    tags = labels.tags_of(back.store, [str(row["id"]) for row in shown])
-    return Response(page_of(shown, tags, next_cursor), media_type="application/json")
+    return Response(page_of(shown, next_cursor), media_type="application/json")
 
 
 @router.get("/{job_id}")
 def get_job(job_id: JobId, back: Back) -> JobDetail:
     """One job with its complete spec."""
-    return JobDetail.of(jobs.get(back.store, job_id), labels.tags_of(back.store, [job_id]).get(job_id, ()))
+    return JobDetail.of(jobs.get(back.store, job_id), labels.tags_of_job(back.store, job_id))
 
 
 @router.post("/{job_id}/{verb}", status_code=202)

@@ -48,7 +48,7 @@ def label(job_id: JobId, request: LabelRequest, back: Back, who: Who) -> JobDeta
     """Write notes, tags or another priority on a job of one's own."""
     who.require_owner("job", jobs.get(back.store, job_id).owner)
     job = labels.change(back.store, job_id, Change(request.notes, request.tags, request.priority))
-    return JobDetail.of(job, labels.tags_of(back.store, [job_id]).get(job_id, ()))
+    return JobDetail.of(job, labels.tags_of_job(back.store, job_id))
 
 
 @router.get("/tags")

@@ -27,13 +27,13 @@ LOOK = ("stage", "step", "steps", "loss", "psnr", "gaussians", "eta_seconds")
 INSTANTS = ("created_at", "started_at", "finished_at")
 
 
-def page_of(rows: Sequence[Mapping[str, Any]], tags: Mapping[str, Sequence[str]], next_cursor: str | None) -> bytes:
+def page_of(rows: Sequence[Mapping[str, Any]], next_cursor: str | None) -> bytes:
     """A ``JobPage`` as JSON."""
-    page = {"items": [line_of(row, tags.get(row["id"], ())) for row in rows], "next_cursor": next_cursor}
+    page = {"items": [line_of(row) for row in rows], "next_cursor": next_cursor}
     return orjson.dumps(page, option=orjson.OPT_UTC_Z)
 
 
-def line_of(row: Mapping[str, Any], tags: Sequence[str]) -> dict[str, Any]:
+def line_of(row: Mapping[str, Any]) -> dict[str, Any]:
     """A ``JobView`` as plain values."""
     state, error = row["state"], row["error"]
     done = 1.0 if state == State.SUCCEEDED else fraction_of(row["stage"], row["step"], row["steps"])
@@ -45,7 +45,7 @@ def line_of(row: Mapping[str, Any], tags: Sequence[str]) -> dict[str, Any]:
         "progress": {"fraction": done, **{name: row[name] for name in LOOK}},
         "error": None if error is None else {"kind": row["error_kind"] or "", "message": error},
         **{name: _instant(row[name]) for name in INSTANTS},
-        "tags": tags,
+        "tags": row["tags"],
     }
 
 

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from services.api.deps import Back, JobId
 from services.api.sources import source_of
+from services.api.threads import waiting
 from services.store import jobs
 
 SHUTTER = r"^(global|blur(:[1-9][0-9]?)?|rolling|bands:[1-9][0-9]{0,3})$"
@@ -60,6 +61,7 @@ class ExportQuery(Look):
 
 
 @router.get("/render", response_class=Response)
+@waiting
 def get_view(job_id: JobId, query: Annotated[ViewQuery, Query()], back: Back, if_none_match: Tag = None) -> Response:
     """A novel view. Integer times of a calibrated camera at its own size are the predictions that were scored."""
     order = query.order(source_of(back, job_id))
@@ -67,6 +69,7 @@ def get_view(job_id: JobId, query: Annotated[ViewQuery, Query()], back: Back, if
 
 
 @router.get("/scene", response_class=Response)
+@waiting
 def get_scene(job_id: JobId, back: Back, if_none_match: Tag = None) -> Response:
     """The avatar and its motion for the viewer in the browser."""
     order = {"verb": "scene", "source": source_of(back, job_id)}
@@ -74,6 +77,7 @@ def get_scene(job_id: JobId, back: Back, if_none_match: Tag = None) -> Response:
 
 
 @router.get("/export/{kind}", response_class=Response)
+@waiting
 def get_export(
     job_id: JobId,
     kind: Literal["ply", "turntable"],

@@ -38,6 +38,13 @@ def measure(sizes: Sizes, say: Callable[[str], None] = print) -> dict[str, Found
         found["grid"] = requests.grid(running, sizes)
         found["curves"] = requests.curves(running, sizes)
         found["api"] = requests.weight(running)
+    with host(api_processes=2) as running:
+        running.start("redis")
+        running.start("api")
+        say("the same of two API processes")
+        found["submit_two"] = requests.submissions(running, sizes)
+        requests.fill(running, sizes.jobs)
+        found["page_two"] = requests.pages(running, sizes)
     for name, part in PARTS.items():
         say(name)
         found[name] = part(sizes)

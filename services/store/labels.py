@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from sqlalchemy import delete, func, insert, select, update
+from sqlalchemy.orm import Session
 
 from services.errors import NotFoundError
 from services.store.jobs import get
@@ -13,6 +14,7 @@ from services.store.records import TERMINAL, Job
 from services.store.session import Store
 from services.store.tables import JobRow, TagRow
 
+TAGS = TagRow.__table__
 UNSEEN = {"synchronize_session": False}
 
 
@@ -47,14 +49,19 @@ def change(store: Store, job_id: str, wanted: Change) -> Job:
     return get(store, job_id)
 
 
-def tags_of(store: Store, job_ids: Iterable[str]) -> dict[str, list[str]]:
+def tags_of(session: Session, job_ids: Iterable[str]) -> dict[str, list[str]]:
     """Tags of every job that has some, in alphabetical order."""
-    query = select(TagRow.job_id, TagRow.tag).where(TagRow.job_id.in_(list(job_ids))).order_by(TagRow.tag)
+    query = select(TAGS.c.job_id, TAGS.c.tag).where(TAGS.c.job_id.in_(list(job_ids))).order_by(TAGS.c.tag)
     found: dict[str, list[str]] = {}
-    with store.read() as session:
-        for job_id, tag in session.execute(query):
-            found.setdefault(job_id, []).append(tag)
+    for job_id, tag in session.connection().execute(query):
+        found.setdefault(job_id, []).append(tag)
     return found
+
+
+def tags_of_job(store: Store, job_id: str) -> Sequence[str]:
+    """Tags of one job, in alphabetical order."""
+    with store.read() as session:
+        return tags_of(session, [job_id]).get(job_id, ())
 
 
 def all_tags(store: Store, limit: int = 500) -> dict[str, int]:

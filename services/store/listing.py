@@ -6,13 +6,14 @@ what the first one does.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import ColumnElement, Select, func, select, tuple_
 from sqlalchemy.orm import Session
 
+from services.store import labels
 from services.store.filters import where
 from services.store.jobs import to_job
 from services.store.records import Filters, Job, State, TableEntry
@@ -70,12 +71,16 @@ def page(store: Store, filters: Filters, order: Order, after: str | None, limit:
         return [to_job(row) for row in session.scalars(query.limit(limit))]
 
 
-def lines(store: Store, filters: Filters, order: Order, after: str | None, limit: int) -> list[Mapping[str, Any]]:
-    """``page`` as lists show it: a few columns and two words of the spec, which else stays in the database."""
+def lines(store: Store, filters: Filters, order: Order, after: str | None, limit: int) -> list[dict[str, Any]]:
+    """``page`` as lists show it: tags, a few columns, and two words of the spec, which else stays in the database."""
     columns = (JobRow.__table__.c[name] for name in LINE)
     with store.read() as session:
         query = _ordered(session, select(*columns, *WORDS).where(*where(filters)), order, after)
-        return [dict(row) for row in session.execute(query.limit(limit)).mappings()]
+        found = session.connection().execute(query.limit(limit))  # plain rows: no objects are made of them
+        names = tuple(found.keys())
+        rows = [dict(zip(names, row, strict=True)) for row in found]
+        tags = labels.tags_of(session, [row["id"] for row in rows])
+    return [row | {"tags": tags.get(row["id"], ())} for row in rows]
 
 
 def _ordered(session: Session, query: Select[Any], order: Order, after: str | None) -> Select[Any]:

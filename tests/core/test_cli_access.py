@@ -88,6 +88,21 @@ def test_tokens_are_issued_listed_and_revoked(
         client.whoami()
 
 
+def test_an_owner_is_bounded_and_listed(
+    service: Service, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log_in(service, monkeypatch, "admin")
+    capsys.readouterr()
+    words = ["owner", "set", "bob", "--queued", "5", "--running", "0", "--share", "2", "--url", service.url]
+    assert cli.main(words) == 0
+    line = capsys.readouterr().out
+    assert line.split() == ["bob", "waiting:", "5", "running:", "no", "limit", "share:", "2"]
+    assert cli.main(["owner", "list", "--url", service.url]) == 0
+    assert line in capsys.readouterr().out
+    assert cli.main([*words, "--share", "0"]) == 1
+    assert "share" in capsys.readouterr().err
+
+
 def test_a_subject_is_uploaded_and_removed(
     service: Service, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

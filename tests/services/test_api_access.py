@@ -107,6 +107,20 @@ def test_scopes_are_steps(closed: httpx.Client, store: Store) -> None:
     assert all("secret" not in each for each in closed.get("/api/v1/tokens", headers=admin).json())
 
 
+def test_an_administrator_bounds_an_owner(closed: httpx.Client, store: Store) -> None:
+    admin, ann = bearer(store, "admin", owner="root"), bearer(store, "submit")
+    allowed = {"max_queued": 1, "max_running": None, "share": 2.0}
+    assert closed.put("/api/v1/owners/ann", json=allowed, headers=ann).status_code == 403
+    reply = closed.put("/api/v1/owners/ann", json=allowed, headers=admin)
+    assert (reply.status_code, reply.json()) == (200, {"name": "ann", **allowed})
+    assert {"name": "ann", **allowed} in closed.get("/api/v1/owners", headers=admin).json()
+    replies = [closed.post("/api/v1/jobs", json={**JOB, "seed": seed}, headers=ann) for seed in (1, 2)]
+    assert [r.status_code for r in replies] == [202, 429]
+    for wrong in ({"max_queued": -1}, {"share": 0}, {"max_running": "many"}, {"more": 1}):
+        assert closed.put("/api/v1/owners/ann", json=wrong, headers=admin).status_code == 422
+    assert closed.put("/api/v1/owners/a:b", json=allowed, headers=admin).status_code == 422
+
+
 def test_expired_and_revoked_tokens_end_at_once(closed: httpx.Client, store: Store) -> None:
     admin = bearer(store, "admin")
     token, secret = tokens.issue(store, "n", "o", ["read"])
