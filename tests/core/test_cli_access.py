@@ -99,7 +99,7 @@ def test_an_owner_is_bounded_and_listed(
     assert line.split() == ["bob", "waiting:", "5", "running:", "no", "limit", "share:", "2"]
     assert cli.main(["owner", "list", "--url", service.url]) == 0
     assert line in capsys.readouterr().out
-    assert cli.main([*words, "--share", "0"]) == 1
+    assert cli.main([*words, "--share", "0"]) == 2
     assert "share" in capsys.readouterr().err
 
 
