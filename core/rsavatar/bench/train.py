@@ -37,7 +37,7 @@ from rsavatar.train import fit
 
 METHODS = ("gauhuman", "mad-avatar", "rs-avatar", "oracle")
 LOOK_SECONDS = 4.0  # of training between two looks
-VIEWS_PER_CAMERA = 3
+VIEWS_PER_CAMERA = 4  # at the middles of as many equal parts of the sequence
 
 
 class _Record(BaseModel):
@@ -77,8 +77,9 @@ class Watch:
 
     def __init__(self, actor: Actor, subject: Subject, prepared: float) -> None:
         self.actor, self.subject, self.prepared = actor, subject, prepared
-        frames = np.linspace(0, subject.frames - 1, min(VIEWS_PER_CAMERA, subject.frames)).round().astype(int)
-        self.views = [(camera, int(frame)) for camera in subject.held_out for frame in sorted(set(frames.tolist()))]
+        views = min(VIEWS_PER_CAMERA, subject.frames)
+        frames = [subject.frames * (2 * i + 1) // (2 * views) for i in range(views)]
+        self.views = [(camera, frame) for camera in subject.held_out for frame in frames]
         self.seconds: list[float] = []
         self.steps: list[int] = []
         self.psnr_db: list[float] = []
