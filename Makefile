@@ -71,7 +71,7 @@ studies: $(SETUP)
 
 URL ?= http://127.0.0.1:8000
 screenshots: $(SETUP)
-	$(BIN)/python docs/screenshots.py $(URL)
+	$(BIN)/python -m docs.screenshots $(URL)
 
 clean:
 	rm -rf .venv build core/*.egg-info core/rsavatar/render/_kernels_*.so

@@ -1,6 +1,6 @@
 """Pictures of every page of a running service, at 1440 and 390 px, light and dark.
 
-    python docs/screenshots.py http://127.0.0.1:8000 [--out docs/screens] [--only job home] [--subject studio]
+    python -m docs.screenshots http://127.0.0.1:8000 [--out docs/screens] [--only job home] [--subject studio]
 
 Needs Chromium and its driver. Only jobs on the built-in subject are shown unless another one is named.
 """
@@ -19,36 +19,16 @@ from typing import Any
 
 from PIL import Image
 from selenium import webdriver
-from selenium.webdriver.chrome.options import Options
-from selenium.webdriver.chrome.service import Service
 
-FLAGS = (
-    "--headless=new",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--hide-scrollbars",
-    "--force-device-scale-factor=1",
-)
+from services.bench.browser import HOW_TO_GET_ONE, open_browser
+
+FLAGS = ("--hide-scrollbars", "--force-device-scale-factor=1")
 WIDTHS = {"wide": 1440, "narrow": 390}
 SCHEMES = ("light", "dark")
 TALLEST = 6000
 QUALITY = 84  # of a stored picture
 NOBODY = "00000000-0000-0000-0000-000000000000"
 DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-
-
-def browser(profile: str) -> webdriver.Chrome:
-    """A fresh headless Chromium."""
-    options = Options()
-    options.binary_location = "/usr/bin/chromium"
-    for flag in (*FLAGS, f"--user-data-dir={profile}"):
-        options.add_argument(flag)
-    return webdriver.Chrome(options, Service("/usr/bin/chromedriver"))
 
 
 def ask(url: str) -> Any:
@@ -112,7 +92,9 @@ def main() -> None:
     options = parser.parse_args()
     base = options.base.rstrip("/")
     with tempfile.TemporaryDirectory() as profile:
-        driver = browser(profile)
+        driver = open_browser(Path(profile), *FLAGS)
+        if driver is None:
+            raise SystemExit(f"no browser here: {HOW_TO_GET_ONE}")
         for name, address in pages(base, options.subject).items():
             if options.only and name not in options.only:
                 continue

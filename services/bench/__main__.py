@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from services.bench import requests, workers
+from services.bench import dashboard, requests, workers
 from services.bench.host import host
 from services.bench.page import render
 from services.bench.promises import figures_of, others_of, targets_of
@@ -34,6 +34,7 @@ def measure(sizes: Sizes, say: Callable[[str], None] = print) -> dict[str, Found
         say(f"pages of {sizes.jobs} jobs")
         requests.fill(running, sizes.jobs)
         found["page"] = requests.pages(running, sizes)
+        found["dashboard"] = dashboard.first_paint(running)
         say("a grid, curves")
         found["grid"] = requests.grid(running, sizes)
         found["curves"] = requests.curves(running, sizes)
@@ -45,6 +46,13 @@ def measure(sizes: Sizes, say: Callable[[str], None] = print) -> dict[str, Found
         found["submit_two"] = requests.submissions(running, sizes)
         requests.fill(running, sizes.jobs)
         found["page_two"] = requests.pages(running, sizes)
+    with host() as running:
+        for name in ("redis", "api"):
+            running.start(name)
+        say("live numbers, figures, views")
+        found["dashboard"] |= dashboard.live(running)
+        running.start("worker")
+        found["dashboard"] |= dashboard.drawings(running)
     for name, part in PARTS.items():
         say(name)
         found[name] = part(sizes)

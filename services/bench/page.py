@@ -20,7 +20,8 @@ method, by a filter. Logging is the heartbeat of a running job (lease, events, m
 20 jobs at once from 4 processes. Dispatch overhead is from the end of one job's work to the first instruction of the
 next job's process. Logging and heartbeats cost the worker's CPU time while a job runs, beyond that of an idle worker;
 its steps take 25 ms of one core, every 25th is told. Recovery is from the loss of a worker to the next attempt of its
-job: killed, its death is proven on the same host; silent (stopped), its lease must run out.
+job: killed, its death is proven on the same host; silent (stopped), its lease must run out. Pages are opened in
+Chromium.
 """
 ELSEWHERE = """\
 Others were measured by others, on other machines: the ratios say in which league a figure plays, not who wins a race.

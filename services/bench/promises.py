@@ -11,7 +11,7 @@ Measured = Mapping[str, Found]
 
 CLOSED = "20 clients without a pause"
 TWO = "two API processes"
-UNITS = {"_ms": "ms", "_s": "s", "_mb": "MB", "_percent": "%", "per_second": "1/s"}
+UNITS = {"_ms": "ms", "_s": "s", "_mb": "MB", "_kb": "KB", "_percent": "%", "per_second": "1/s"}
 TARGETS: tuple[tuple[str, str, float, str, str], ...] = (  # part, figure, bound, sense, name
     ("submit", "per_second", 300.0, "at least", f"POST /jobs, {CLOSED}"),
     ("submit", "paced_p95_ms", 30.0, "at most", "POST /jobs at 300/s from 20 clients, p95"),
@@ -36,6 +36,13 @@ TARGETS: tuple[tuple[str, str, float, str, str], ...] = (  # part, figure, bound
     ("overhead", "overhead_percent", 0.5, "at most", "logging and heartbeats, of the job's CPU time"),
     ("recovery", "recovery_killed_s", 90.0, "at most", "recovery from a killed worker"),
     ("recovery", "recovery_silent_s", 90.0, "at most", "recovery from a worker that fell silent"),
+    ("dashboard", "first_paint_ms", 1000.0, "at most", "first paint of the jobs page, 100 000 jobs, empty cache"),
+    ("dashboard", "loaded_kb", 300.0, "at most", "its bytes, styles, scripts and fonts included, compressed"),
+    ("dashboard", "live_worst_ms", 1000.0, "at most", "a worker's report on the page of its job, worst of 10"),
+    ("dashboard", "figure_first_s", 5.0, "at most", "a figure, the first: its process starts"),
+    ("dashboard", "figure_s", 5.0, "at most", "a figure"),
+    ("dashboard", "view_p50_ms", 100.0, "at most", "novel view, 512 px, p50"),
+    ("dashboard", "rolling_view_p50_ms", 100.0, "at most", "novel view through a rolling shutter, 512 px, p50"),
     ("api", "rss_mb", 150.0, "at most", "memory of the API's process"),
     ("api", "torch", 0.0, "at most", "torch in the API's process"),
 )
@@ -102,6 +109,7 @@ def targets_of(found: Measured) -> list[Target]:
             unit=unit_of(figure),
         )
         for part, figure, bound, sense, name in TARGETS
+        if figure in found[part]  # without a browser, nothing is known of pages
     ]
 
 

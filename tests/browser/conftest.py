@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -12,9 +10,8 @@ from contextlib import ExitStack
 import httpx
 import pytest
 from selenium import webdriver
-from selenium.webdriver.chrome.options import Options
-from selenium.webdriver.chrome.service import Service
 
+from services.bench.browser import HOW_TO_GET_ONE, open_browser
 from services.demo import free_port
 from services.process import stop, terminate_with_parent
 from services.settings import ROOT
@@ -22,19 +19,6 @@ from tests.browser.front import Front
 from tests.core.subject_files import write_rolling
 from tests.system.harness import Host, until
 
-FLAGS = (
-    "--headless=new",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--disable-dev-shm-usage",
-    "--no-first-run",
-    "--no-proxy-server",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--window-size=1280,1000",
-)
 REAL = (sys.executable, "-m", "services.worker.child")
 SUBJECT = "figure"
 
@@ -92,18 +76,9 @@ def answers(site: Site) -> bool:
 @pytest.fixture(scope="session")
 def driver(tmp_path_factory: pytest.TempPathFactory) -> Iterator[webdriver.Chrome]:
     """A fresh Chromium; tests that need it say so where there is none."""
-    binary = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    programme = shutil.which("chromedriver")
-    if binary is None or programme is None:
-        pytest.skip("no browser here: apt-get install chromium chromium-driver")
-    options = Options()
-    options.binary_location = binary
-    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    environment = {k: v for k, v in os.environ.items() if "proxy" not in k.lower()}
-    found = webdriver.Chrome(options, Service(programme, env=environment))
-    found.set_page_load_timeout(40)
+    found = open_browser(tmp_path_factory.mktemp("profile"), "--window-size=1280,1000")
+    if found is None:
+        pytest.skip(f"no browser here: {HOW_TO_GET_ONE}")
     yield found
     found.quit()
 

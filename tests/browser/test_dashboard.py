@@ -66,6 +66,17 @@ def loaded(browser: webdriver.Chrome) -> bool:
     return bool(browser.execute_script(script))
 
 
+def test_ticks_of_values_that_differ_by_a_rounding_error_end(browser: webdriver.Chrome, site: Site) -> None:
+    browser.get(f"{site.url}/figures")
+    script = (
+        "const done = arguments[2]; import('/static/plot.js').then((m) => done(m.ticks(arguments[0], arguments[1])))"
+    )
+    for low, high in ((0.1, 0.1 + 2e-17), (0.1, 0.10000000000000002), (7.0, 7.0), (0.0, 0.0), (-1.0, 1.0)):
+        found = browser.execute_async_script(script, low, high)
+        assert len(found) <= 6
+        assert all(low - 1e-8 <= tick <= high + 1e-8 for tick in found)
+
+
 def test_a_job_goes_from_the_form_to_its_pictures_without_a_reload(browser: webdriver.Chrome, site: Site) -> None:
     browser.get(f"{site.url}/")
     press(browser, "a[href='/jobs/new']")

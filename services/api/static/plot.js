@@ -9,7 +9,8 @@ export function node(name, attributes = {}, text = null) {
 }
 
 export function ticks(low, high, most = 5) {
-  const span = high - low || 1, rough = span / most, power = 10 ** Math.floor(Math.log10(rough));
+  const span = Math.max(high - low, 1e-9 * Math.abs(high)) || 1; // a span of rounding errors has no ticks to count
+  const rough = span / most, power = 10 ** Math.floor(Math.log10(rough));
   const step = [1, 2, 5, 10].map((f) => f * power).find((s) => s >= rough);
   const found = [];
   for (let i = Math.ceil(low / step - 1e-9); i * step <= high + step * 1e-9; i++) found.push(Number((i * step).toPrecision(12)));
