@@ -77,7 +77,7 @@ def test_ticks_of_values_that_differ_by_a_rounding_error_end(browser: webdriver.
         assert all(low - 1e-8 <= tick <= high + 1e-8 for tick in found)
 
 
-def test_a_job_goes_from_the_form_to_its_pictures_without_a_reload(browser: webdriver.Chrome, site: Site) -> None:
+def test_a_job_goes_from_the_form_to_its_pictures_by_itself(browser: webdriver.Chrome, site: Site) -> None:
     browser.get(f"{site.url}/")
     press(browser, "a[href='/jobs/new']")
     for name, value in (("method", "rs-avatar"), ("subject", SUBJECT), ("preset", "smoke")):
@@ -97,6 +97,7 @@ def test_a_job_goes_from_the_form_to_its_pictures_without_a_reload(browser: webd
     press(browser, "[type=submit]")
     wait(browser, lambda b: b.find_elements(By.CSS_SELECTOR, "article[data-job]"))
     wait(browser, lambda b: one(b, "article").get_attribute("data-state") == "succeeded")
+    wait(browser, lambda b: b.find_elements(By.CSS_SELECTOR, "[data-heat] button"))  # the page has taken the result in
     wait(browser, loaded)
     assert one(browser, "[data-heat] button").is_displayed()
     assert one(browser, ".lead-figure dd").text.strip().endswith("dB")
