@@ -16,6 +16,7 @@ from services.api.access import Who
 from services.api.deps import Back, Backend
 from services.api.recognise import inspect
 from services.api.requests import SUBJECT_NAME, SubjectRequest
+from services.api.threads import waiters
 from services.api.views import SubjectView
 from services.errors import ConflictError, RequestError
 from services.settings import LOOPBACK, Settings
@@ -66,7 +67,9 @@ async def create(request: Request, response: Response, back: Back, who: Who, nam
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() == "application/json":
         is_operator = not back.settings.needs_token and request.client is not None and request.client.host in LOOPBACK
         body = parse(await request.body())
-        subject, is_new = await anyio.to_thread.run_sync(register, back, body, who.owner, is_operator)
+        subject, is_new = await anyio.to_thread.run_sync(
+            register, back, body, who.owner, is_operator, limiter=waiters()
+        )
         response.status_code = 201 if is_new else 200
     else:
         if name is None:

@@ -26,7 +26,8 @@ def limit() -> None:
 
 
 @functools.cache
-def _waiters() -> anyio.CapacityLimiter:
+def waiters() -> anyio.CapacityLimiter:
+    """Whom routes that wait, or work for seconds, take their threads from."""
     return anyio.CapacityLimiter(WAITING)
 
 
@@ -36,6 +37,6 @@ def waiting(route: Callable[Arguments, Answer]) -> Callable[Arguments, Awaitable
     @functools.wraps(route)
     async def run(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Answer:
         call = functools.partial(route, *args, **kwargs)
-        return await anyio.to_thread.run_sync(call, limiter=_waiters())
+        return await anyio.to_thread.run_sync(call, limiter=waiters())
 
     return run

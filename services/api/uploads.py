@@ -21,6 +21,7 @@ from starlette.exceptions import HTTPException
 from services.api.guard import archive_kind
 from services.api.health import LEAST_FREE_BYTES
 from services.api.recognise import inspect
+from services.api.threads import waiters
 from services.errors import ConflictError, NotFoundError, RequestError
 from services.settings import ROOT, Settings
 from services.store import subjects
@@ -66,7 +67,8 @@ async def receive(request: Request, name: str, owner: str, settings: Settings, s
             settings.max_entries,
         )
         size = await unpack(order)
-        return await anyio.to_thread.run_sync(settle, folder / "content", name, owner, size, settings, store)
+        content = folder / "content"
+        return await anyio.to_thread.run_sync(settle, content, name, owner, size, settings, store, limiter=waiters())
 
 
 @asynccontextmanager
