@@ -52,7 +52,7 @@ def benchmarks_page(
     request: Request, back: Back, commit: Annotated[str | None, Query(pattern=r"^[0-9a-z-]{0,64}$")] = None
 ) -> HTMLResponse:
     """The newest run of every benchmark, or those of a commit; earlier runs show whether something got slower."""
-    everything = stored(back.store)
+    everything = [m for m in stored(back.store) if m.kind in TITLES or m.payload.get("targets")]  # what is drawn here
     commits = list(dict.fromkeys(m.commit for m in reversed(everything)))
     wanted = [m for m in everything if not commit or m.commit == commit]
     chosen = {m.kind: m for m in wanted}  # the newest of a kind comes last

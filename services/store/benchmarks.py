@@ -44,7 +44,7 @@ def discover(store: Store, folder: Path) -> None:
         except ValueError:
             continue
         if isinstance(payload, dict) and isinstance(payload.get("machine"), dict):
-            add(store, str(payload.get("kind", path.stem)), payload)
+            add(store, str(payload.get("name") or payload.get("kind") or path.stem), payload)
 
 
 def add(store: Store, name: str, payload: Mapping[str, Any]) -> str:
