@@ -24,11 +24,11 @@ job: killed, its death is proven on the same host; silent (stopped), its lease m
 Chromium.
 """
 FLOOR = """\
-**Where the floor is.** A submission takes 4 ms of the interpreter, three quarters of it in the web framework and its
-middlewares (sampled); commits, audit records and wake-ups are shared by all that wait, and the clients take a quarter
-of the two cores. Who asks without a pause waits for the work of all twenty: a p95 of 30 ms would be 700 answers a
+**Where the floor is.** A submission takes 4 ms of the interpreter, most of it in the web framework and its
+middlewares (sampled); commits, audit records and wake-ups are shared by all that wait, and the clients run on the
+same two cores. Who asks without a pause waits for the work of all twenty: a p95 of 30 ms would be 700 answers a
 second. A page takes 6 ms, half of them between database and rows. Tried: forty threads in place of four (84 in place
-of 122 pages a second, and seconds of waiting at 100 a second: each thread waits for the interpreter at every row),
+of 116 pages a second, and seconds of waiting at 100 a second: each thread waits for the interpreter at every row),
 shorter turns of the interpreter (no change), rows in place of objects (a sixth less), a second process (above: it
 pays where a core is left over). 500 metrics are 500 rows of a key and an index: 10 ms of SQLite's writing, in which
 all twenty stand in line; a table without row ids would save a quarter.
