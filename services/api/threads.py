@@ -1,5 +1,6 @@
-"""Threads that answer. The interpreter runs one at a time, and hands over at every row that a query reads: forty threads
-gave 84 pages a second to twenty clients, four 116 (docs/benchmarks/service.md).
+"""Threads that answer. The interpreter runs one at a time, and hands over at every row that a query reads.
+
+Forty threads gave 84 pages a second to twenty clients, four 116 (docs/benchmarks/service.md).
 
 Routes that are plain functions share ``QUICK`` threads, which is all that a process can use. A route that waits for
 another process (a drawing) is ``waiting``, so that it keeps nobody else from an answer.
