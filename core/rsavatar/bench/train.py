@@ -1,7 +1,7 @@
 """``rsavatar bench train``: held-out PSNR against the seconds of training, for each method at one budget.
 
 Trains ``--preset`` on each of ``--subjects``, or on the built-in one. What a method prepares before its first step is
-counted as training; looking at the held-out views is not, and changes no number of it.
+counted as training, with a cache that holds nothing; looking at the held-out views is not, and changes no number of it.
 """
 
 from __future__ import annotations
@@ -9,7 +9,8 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
@@ -35,7 +36,6 @@ from rsavatar.optimization import Saver
 from rsavatar.spec import resolve
 from rsavatar.train import fit
 
-METHODS = ("gauhuman", "mad-avatar", "rs-avatar", "oracle")
 LOOK_SECONDS = 4.0  # of training between two looks
 VIEWS_PER_CAMERA = 4  # at the middles of as many equal parts of the sequence
 
@@ -116,25 +116,40 @@ def curve(name: str, subject: Subject, preset: str = "draft") -> TrainingCurve:
     begun = time.perf_counter()
     spec = resolve({"method": name, "subject": subject.name, "preset": preset})
     method: AbstractMethod = catalog.load(catalog.METHODS, name)()
-    case = method.prepare(Case(spec, subject, find_body(spec.body, subject)[0]), silent, lambda: False).case
-    actor = build_actor(method, case)
-    watch = Watch(actor, subject, time.perf_counter() - begun)
+    case = Case(spec, subject, find_body(spec.body, subject)[0])
     with tempfile.TemporaryDirectory() as folder:
+        with _empty_cache(Path(folder)):
+            case = method.prepare(case, silent, lambda: False).case
+        actor = build_actor(method, case)
+        watch = Watch(actor, subject, time.perf_counter() - begun)
         owner = Owner(spec.sha256(), subject.fingerprint, case.body.sha256, __version__)
         saver = Saver(Path(folder) / "checkpoint.safetensors", owner)
         fit(actor, observations(method, case), settings(case), saver, watch, lambda: False)
     return TrainingCurve(method=name, seconds=watch.seconds, steps=watch.steps, psnr_db=watch.psnr_db)
 
 
+@contextmanager
+def _empty_cache(folder: Path) -> Iterator[None]:
+    """Nothing is found in the cache; what is built goes to ``folder``."""
+    before = os.environ.get("RSAVATAR_CACHE")
+    os.environ["RSAVATAR_CACHE"] = str(folder)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["RSAVATAR_CACHE"]
+        else:
+            os.environ["RSAVATAR_CACHE"] = before
+
+
 def ahead_from(curves: Sequence[TrainingCurve], ours: str = "rs-avatar") -> float | None:
     """Seconds of training from which on ``ours`` is above every other learned method's curve; None if it never is.
 
-    Curves are compared at all looks of all of them up to the end of the shortest, linearly between looks.
+    Curves are compared at all looks of all of them, linearly between looks; each holds its last value from its end on.
     """
     others = [c for c in curves if c.method not in (ours, "oracle")]
     mine = next(c for c in curves if c.method == ours)
-    end = min(c.seconds[-1] for c in (mine, *others))
-    looks = sorted({t for c in (mine, *others) for t in c.seconds if t <= end})
+    looks = sorted({t for c in (mine, *others) for t in c.seconds})
     best = np.max([np.interp(looks, c.seconds, c.psnr_db) for c in others], axis=0)
     behind = np.flatnonzero(np.interp(looks, mine.seconds, mine.psnr_db) <= best)
     if len(behind) == len(looks) or (len(behind) and behind[-1] == len(looks) - 1):
@@ -205,7 +220,7 @@ def main(json: Path | None, subjects: Sequence[str] = (), preset: str = "draft")
 def curves_of(subject: Subject, console: Console, preset: str) -> SubjectCurves:
     """Every method that the subject allows, one after the other."""
     curves = []
-    for name in METHODS:
+    for name in catalog.METHODS:
         if name != "oracle" or subject.motion is not None:
             console.print(f"training {name} on {subject.name} ...")
             curves.append(curve(name, subject, preset))
