@@ -3,7 +3,8 @@
 # make test   set up, run all tests
 # make check  format, lint, types, import contracts
 # make check-native  the kernels under address, undefined-behaviour and thread sanitizers
-# make soak   a thousand small trainings while something is killed every few seconds; SOAK='--jobs 100 --postgresql'
+# make soak   a grid of a thousand small trainings while something is killed every few seconds; SOAK='--jobs 100 --postgresql'
+#             SOAK='--grid ablation --subjects DIR --set preset=draft --kill-every 60' runs that grid and prints its table
 # make paper-table ZJU=DIR  the paper's whole table, from ZJU-MoCap (my_377 ..) on disk
 # make bench  the long measurements; results in docs/benchmarks
 # make screenshots URL=http://127.0.0.1:8000   every page of a running service, into docs/screens

@@ -50,7 +50,9 @@ class Host:
     """A home, its private broker, and the processes that work in it."""
 
     def __init__(self, home: Path, port: int, **changes: Any) -> None:
-        self.settings = Settings(home=home, port=port, **{**QUICK, **changes})
+        given = {"home": home, "port": port, **QUICK, **changes}
+        self.settings = Settings(**given)
+        self._given = set(given)
         make_home(self.settings)
         self.store = Store(self.settings)
         schema.migrate(self.store)
@@ -59,9 +61,9 @@ class Host:
 
     @property
     def env(self) -> dict[str, str]:
-        """The settings as a deployment would give them."""
+        """The settings as a deployment would give them; those of the environment stay as they are there."""
         env = dict(os.environ)
-        for name, value in self.settings.model_dump(exclude_defaults=True, mode="json").items():
+        for name, value in self.settings.model_dump(include=self._given, exclude_defaults=True, mode="json").items():
             env[f"RSAVATAR_{name.upper()}"] = json.dumps(value) if isinstance(value, list) else str(value)
         return env
 

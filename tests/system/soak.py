@@ -1,208 +1,205 @@
-"""``make soak``: many jobs while something is killed every few seconds.
+"""``make soak``: a grid of jobs while something is killed every few seconds.
 
-Every distinct job is run once in peace. Then many of them are run again while workers, the processes that train, the
-API and the broker (which also loses its memory) are killed in turn. At the end every job must have succeeded exactly
-once with the numbers of its peaceful run, and no process, file or row may be left over.
+The grid's distinct jobs run once in peace. Then the grid runs while workers, the processes that train, the API and the
+broker (which also loses its memory) are killed in turn. At the end every job must have succeeded exactly once with the
+numbers of its peaceful run, the grid must tell of every job once, and no process, file or row may be left over.
+
+The soak's own grid is made of ``--distinct`` jobs at as many checkpoint intervals as it takes; those move no number.
+``--grid`` runs another one, with the words of ``rsavatar grid``, and ends with its table:
+
+  python -m tests.system.soak --grid ablation --subjects DIR --set preset=draft --kill-every 60 --table ablation.tex
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
-import random
-import signal
 import statistics
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import redis
 from sqlalchemy import func, select
 
+from rsavatar import cli_grid
+from rsavatar.grids.request import GridRequest
+from rsavatar.report.tables import TABLES
+from services.api.tables import MIMES
 from services.demo import free_port
 from services.settings import Settings
-from services.store import events, garbage
-from services.store.tables import ArtifactRow, CheckpointRow, EventRow, JobRow, ResultRow
+from services.store import events
+from services.store.records import TERMINAL
+from services.store.tables import JobRow
 from tests import postgresql
+from tests.system import checks
+from tests.system.fire import WORKERS, Fire
 from tests.system.harness import Host, until
+from tests.system.lives import Life, life_of
 
 REAL = Settings.model_fields["child_command"].default
-WORKERS = ("worker", "worker-2")
-LEFT_OVER = ("*.tmp", "*.part", "incoming-*")
-Numbers = dict[str, Any]
+SHORTEST = 25  # steps between two checkpoints: of a hundred steps there is always one before the end
+ALL = 1_000_000  # events of a job
+SHOWN = 100  # jobs that a report names one by one
+Json = Mapping[str, Any]
 
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    words = argparse.ArgumentParser("tests.system.soak", description=__doc__)
-    words.add_argument("--jobs", type=int, default=1000, help="jobs under fire (default: 1000)")
-    words.add_argument("--distinct", type=int, default=4, help="distinct jobs among them (default: 4)")
-    words.add_argument("--kill-every", type=float, default=4.0, metavar="SECONDS", help="mean pause (default: 4)")
+    words = argparse.ArgumentParser(
+        "tests.system.soak", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    words.add_argument("--jobs", type=int, default=1000, help="of the soak's own grid (default: 1000)")
+    words.add_argument("--distinct", type=int, default=20, help="distinct jobs among them (default: 20)")
     words.add_argument("--iterations", type=int, default=100, help="optimiser steps of a job (default: 100)")
+    words.add_argument("--grid", metavar="GRID", help="instead, a built-in grid or a TOML file")
+    words.add_argument("--subjects", default="", metavar="A,B", help="on these: built-in names, or folders")
+    words.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a word of all jobs, or an axis")
+    words.add_argument("--peace", action="store_true", help="run that grid in peace first, and compare the numbers")
+    endings = ", ".join(MIMES)
+    words.add_argument("--table", type=Path, action="append", default=[], metavar="FILE",
+                       help=f"the grid's table, by its ending ({endings}); else LaTeX, printed")  # fmt: skip
+    words.add_argument("--kill-every", type=float, default=4.0, metavar="SECONDS", help="mean pause (default: 4)")
+    words.add_argument("--seed", type=int, default=0, help="of the order of kills")
     words.add_argument("--quick", action="store_true", help="count in place of training: tests the service alone")
     words.add_argument("--postgresql", action="store_true", help="on PostgreSQL (default: SQLite)")
-    words.add_argument("--seed", type=int, default=0, help="of the order of kills")
+    words.add_argument("--home", type=Path, metavar="DIR", help="a new folder, kept (default: one that disappears)")
     return words
 
 
-class Soak:
-    """One run."""
+def own_grid(options: argparse.Namespace) -> GridRequest:
+    """As many jobs as asked for, of few distinct results."""
+    distinct = [
+        {"label": f"{method} {number}", "method": method, "seed": number, "priority": number % 3,
+         "iterations": options.iterations + number}
+        for number in range(options.distinct) for method in [("rs-avatar", "gauhuman")[number % 2]]
+    ]  # fmt: skip
+    intervals = range(SHORTEST, SHORTEST + options.jobs // options.distinct)
+    base = {"subject": "studio", "preset": "smoke"}
+    return GridRequest(name="soak", base=base, axes={"job": distinct, checks.NOT_OF_NUMBERS: list(intervals)})
 
-    def __init__(self, host: Host, options: argparse.Namespace) -> None:
-        self.host = host
-        self.options = options
-        self.random = random.Random(options.seed)
-        self.kills: Counter[str] = Counter()
-        self.times: list[tuple[float, str]] = []  # database clock, job that lost its process
 
-    def submit(self, number: int) -> str:
-        """Job ``number`` of the distinct ones."""
-        method = ("rs-avatar", "gauhuman")[number % 2]
-        return self.host.submit(
-            method=method, seed=number, iterations=self.options.iterations, checkpoint_every=50, priority=number % 3
-        )
+def named_grid(host: Host, options: argparse.Namespace) -> GridRequest:
+    """The grid of the command line, its folders registered as subjects."""
+    names = [register(host, word) for word in options.subjects.split(",") if word]
+    return cli_grid.read(argparse.Namespace(name=options.grid, set=options.set, subjects=",".join(names)))
 
-    def numbers(self, job: str) -> Numbers:
-        """What a job found, without what depends on the clock."""
-        found = self.host.client.get(f"/api/v1/jobs/{job}/results").json()
-        return {name: found[name] for name in ("means", "per_camera", "scores", "gaussians")}
 
-    def in_peace(self) -> list[Numbers]:
-        """Every distinct job once, undisturbed."""
-        jobs = [self.submit(number) for number in range(self.options.distinct)]
-        for job in jobs:
-            self.host.wait_for(job, "succeeded", seconds=600.0)
-        return [self.numbers(job) for job in jobs]
+def register(host: Host, word: str) -> str:
+    """The name of a subject, which a folder gets."""
+    folder = Path(word).resolve()
+    if "/" not in word:
+        return word
+    reply = host.client.post("/api/v1/subjects", json={"name": folder.name, "path": str(folder)})
+    assert reply.is_success, reply.text
+    return folder.name
 
-    def under_fire(self) -> list[str]:
-        """All jobs, with kills until the last has ended."""
-        jobs = [self.submit(number % self.options.distinct) for number in range(self.options.jobs)]
-        faults: list[Callable[[], None]] = [self.kill_worker, self.kill_child, self.kill_worker, self.kill_child]
-        faults += [self.kill_api, self.kill_broker]
-        while self.ended() < self.options.jobs + self.options.distinct:
-            self.random.choice(faults)()
-            time.sleep(self.random.uniform(0.5, 1.5) * self.options.kill_every)
-        return jobs
 
-    def ended(self) -> int:
-        """Jobs that will not run again."""
-        with self.host.store.read() as session:
-            return session.scalar(select(func.count()).where(JobRow.state.in_(("succeeded", "failed", "dead")))) or 0
+def submit(host: Host, request: GridRequest) -> Json:
+    """The accepted grid, whose jobs run whatever is known."""
+    reply = host.client.post("/api/v1/grids", params={"force": True}, json=request.model_dump(mode="json"))
+    assert reply.status_code == 202, reply.text
+    found: Json = reply.json()
+    return found
 
-    def kill_worker(self) -> None:
-        name = self.random.choice(WORKERS)
-        self._note(name)
-        self.host.kill(name)
-        self.host.start(name)
 
-    def kill_child(self) -> None:
-        children = self.host.children()
-        if children:
-            self._note("child")
-            self.random.choice(children).send_signal(signal.SIGKILL)
+def ended(host: Host, grid: str) -> int:
+    """Jobs of a grid that will not run again."""
+    mine = (JobRow.grid_id == grid) & JobRow.state.in_(TERMINAL)
+    with host.store.read() as session:
+        return session.scalar(select(func.count()).where(mine)) or 0
 
-    def kill_api(self) -> None:
-        self._note("api")
-        self.host.kill("api")
-        self.host.start("api")
 
-    def kill_broker(self) -> None:
-        self._note("redis with FLUSHALL")
-        with redis.Redis(unix_socket_path=str(self.host.settings.socket)) as client:
-            client.flushall()
-        self.host.kill("redis")
-        self.host.start("redis")
+def in_peace(host: Host, request: GridRequest) -> dict[checks.Place, Json]:
+    """Every distinct job once, undisturbed: its numbers by its place."""
+    axes = {name: values for name, values in request.axes.items() if name != checks.NOT_OF_NUMBERS}
+    grid = submit(host, request.model_copy(update={"name": "peace", "axes": axes}))
+    until(lambda: ended(host, grid["id"]) == grid["jobs"], 86_400.0)
+    return {checks.place_of(cell): checks.numbers(host, cell["job_id"]) for cell in grid["cells"]}
 
-    def _note(self, what: str) -> None:
-        self.kills[what.partition("-")[0]] += 1
-        ended = self.ended()
-        print(f"{time.strftime('%H:%M:%S')} kill {what}; {ended} ended", file=sys.stderr, flush=True)
 
-    def recoveries(self) -> list[float]:
-        """Seconds between the loss of an attempt, as the database noted it, and the next attempt's beginning."""
-        with self.host.store.read() as session:
-            rows = session.scalars(select(EventRow).where(EventRow.kind == "state").order_by(EventRow.id)).all()
-        lost: dict[str, float] = {}
-        found = []
-        for row in rows:
-            if row.payload["state"] == "queued" and "reason" in row.payload:
-                lost[row.job_id] = row.created_at
-            elif row.payload["state"] == "running" and row.job_id in lost:
-                found.append(row.created_at - lost.pop(row.job_id))
-        return found
-
-    def verify(self, jobs: list[str], expected: list[Numbers]) -> list[str]:
-        """Sentences about what is wrong."""
-        wrong = []
-        for number, job in enumerate(jobs):
-            state = self.host.job(job)["state"]
-            if state != "succeeded":
-                wrong.append(f"job {job} is {state}")
-            elif self.numbers(job) != expected[number % len(expected)]:
-                wrong.append(f"job {job} has other numbers than its peaceful run")
-            told = [e for e in events.after(self.host.store, 0, job, limit=100_000) if e.kind == "state"]
-            endings = [e.payload["state"] for e in told if e.payload["state"] in {"succeeded", "failed", "dead"}]
-            if len(endings) != 1:
-                wrong.append(f"job {job} has ended {len(endings)} times: {endings}")
-        return wrong + self.left_over()
-
-    def left_over(self) -> list[str]:
-        """Processes, files and rows that belong to nothing."""
-        host, wrong = self.host, []
-        wrong += [f"process {child.pid} still runs" for child in host.children()]
-        garbage.collect(host.store, host.settings.home / "jobs", -1.0, dry_run=False)
-        wrong += [f"file {path}" for pattern in LEFT_OVER for path in host.settings.home.rglob(pattern)]
-        with host.store.read() as session:
-            named = set(session.scalars(select(ArtifactRow.sha256)))
-            ids = set(session.scalars(select(JobRow.id)))
-            results = session.scalars(select(ResultRow.job_id)).all()
-            checkpoints = session.scalars(select(CheckpointRow.job_id)).all()
-        stored = {blob.sha256 for blob in host.store.blobs.all()}
-        wrong += [f"blob {sha256} is {word}" for word, some in (("unnamed", stored - named), ("lost", named - stored))
-                  for sha256 in some]  # fmt: skip
-        wrong += [f"folder {path}" for path in (host.settings.home / "jobs").iterdir() if path.name not in ids]
-        wrong += [f"{len(results)} results of {len(ids)} jobs"] if sorted(results) != sorted(ids) else []
-        return wrong + [f"checkpoint row of {job}" for job in checkpoints]
+def report_of(grid: Json, lives: Sequence[Life]) -> dict[str, Any]:
+    """What the jobs went through."""
+    waits = [wait for life in lives for wait in life.waits]
+    lost = [life.seconds_lost for life in lives]
+    by_job = {
+        ", ".join(cell["place"].values()): f"attempts {life.attempts}, seconds lost {life.seconds_lost:.1f}"
+        for cell, life in zip(grid["cells"], lives, strict=True)
+    }
+    return {
+        "grid": grid["name"], "jobs": grid["jobs"], "counts": {k: v for k, v in grid["counts"].items() if v},
+        "attempts": dict(sorted(Counter(life.attempts for life in lives).items())),
+        "seconds_lost": {"sum": round(sum(lost), 1), "max": round(max(lost), 1)},
+        "requeued_to_running_seconds": {"median": round(statistics.median(waits), 2),
+                                        "max": round(max(waits), 2)} if waits else None,
+    } | ({"by_job": by_job} if len(lives) <= SHOWN else {})  # fmt: skip
 
 
 def run(options: argparse.Namespace, host: Host) -> bool:
     """Everything; prints a report as JSON. Whether nothing is wrong."""
     for name in ("redis", "api", *WORKERS):
         host.start(name)
-    soak = Soak(host, options)
-    expected = soak.in_peace()
+    request = named_grid(host, options) if options.grid else own_grid(options)
+    expected = in_peace(host, request) if options.peace or not options.grid else {}
     begun = time.monotonic()
-    jobs = soak.under_fire()
+    grid = submit(host, request)
+    fire = Fire(host, options.kill_every, options.seed)
+    fire.until(lambda: ended(host, grid["id"]) == grid["jobs"], lambda: f"{ended(host, grid['id'])} ended")
     seconds = time.monotonic() - begun
     until(lambda: not host.children(), 60.0)
-    wrong = soak.verify(jobs, expected)
-    attempts = Counter(host.job(job)["attempt"] for job in jobs)
-    recoveries = soak.recoveries()
-    report = {
-        "jobs": len(jobs), "distinct": options.distinct, "seconds": round(seconds), "kills": dict(soak.kills),
-        "attempts": dict(sorted(attempts.items())), "wrong": wrong,
+    grid = host.client.get(f"/api/v1/grids/{grid['id']}").json()
+    lives = [life_of(events.after(host.store, 0, cell["job_id"], ALL)) for cell in grid["cells"]]
+    wrong = [*checks.of_grid(host, grid), *checks.of_jobs(host, grid["cells"], lives, expected)]
+    wrong += checks.left_over(host)
+    report = report_of(grid, lives) | {
+        "seconds": round(seconds), "kills": dict(fire.kills), "compared_with": len(expected), "wrong": wrong,
         "database": host.store.engine.dialect.name, "child": "count" if options.quick else "training",
-        "requeued_to_running_seconds": {"median": round(statistics.median(recoveries), 2),
-                                        "max": round(max(recoveries), 2)} if recoveries else None,
     }  # fmt: skip
-    print(json.dumps(report, indent=1))
+    print(json.dumps(report, indent=1), flush=True)
+    tables(host, grid, options)
     return not wrong
 
 
+def tables(host: Host, grid: Json, options: argparse.Namespace) -> None:
+    """The table of the grid's name, else the main one, as the API gives it."""
+    name = grid["name"] if grid["name"] in TABLES else "main"
+    for file in options.table or ([None] if options.grid else []):
+        form = "tex" if file is None else file.suffix[1:]
+        text = host.client.get(f"/api/v1/tables/{name}.{form}", params={"grid": grid["id"]}).raise_for_status().text
+        if file is None:
+            print(text)
+        else:
+            file.write_text(text, "utf-8")
+
+
+def read(words: Sequence[str] | None = None) -> argparse.Namespace:
+    """The options, refused where they make no grid."""
+    line = parser()
+    options = line.parse_args(words)
+    if options.jobs % options.distinct:
+        line.error(f"--jobs: expected a multiple of --distinct = {options.distinct}, got {options.jobs}")
+    if strange := [file for file in options.table if file.suffix[1:] not in MIMES]:
+        line.error(f"--table: expected an ending of {', '.join(MIMES)}, got {strange[0]}")
+    return options
+
+
 def main() -> int:
-    """Run it in a home that disappears."""
-    options = parser().parse_args()
+    """Run it in a home of its own."""
+    options = read()
     changes: dict[str, Any] = {"max_attempts": 1000, "worker_concurrency": 1, "threads_per_job": 1, "gc_hours": 0.0}
+    changes |= {"max_grid_jobs": max(1000, options.jobs)}
     changes |= {} if options.quick else {"child_command": REAL, "stall_seconds": 300.0}
-    with tempfile.TemporaryDirectory(prefix="rsavatar-soak-") as folder, postgresql.running() as server:
+    with contextlib.ExitStack() as stack:
+        folder = options.home or stack.enter_context(tempfile.TemporaryDirectory(prefix="rsavatar-soak-"))
+        server = stack.enter_context(postgresql.running()) if options.postgresql else None
         if options.postgresql:
             assert server is not None, "no PostgreSQL here"
             changes["database_url"] = server.migrated()
-        host = Host(Path(folder) / "home", free_port(), **changes)
+        host = Host(Path(folder).resolve() / "home", free_port(), **changes)
         try:
             return 0 if run(options, host) else 1
         finally:
