@@ -128,6 +128,8 @@ def _ablation(runs: Sequence[Run], wish: Wish) -> Figure:
 
 def _shutter(runs: Sequence[Run], wish: Wish) -> Figure:
     whole = [run for run in runs if not run.ablation and run.means.get("psnr") is not None]
+    swept = {run.subject for run in whole if run.method == OURS and run.bands != "scanline"}
+    whole = [run for run in whole if run.subject in swept] if swept else whole  # means of equal subjects
     modelled = [run for run in whole if run.method in {OURS, "mad-avatar"}]
     sweep = []
     for group in groups(modelled, lambda r: (r.method, r.bands)):

@@ -15,6 +15,7 @@ from rsavatar.report.palette import INK, SOFT, label_of, look_of
 from rsavatar.report.runs import OURS, Figure
 
 SINGLE, DOUBLE = 3.25, 6.875  # inches: one column, two
+ABREAST = 4  # names of a legend beside one another on two columns
 BASE = "gauhuman"
 Data = Mapping[str, Any]
 
@@ -110,7 +111,8 @@ CURVES = {"psnr": ("PSNR on the input, dB", "linear"), "loss": ("loss", "log")}
 
 def curves(paper: Paper, figure: Figure, pictures: Data) -> None:
     """Training curves, a panel per quantity."""
-    paper.set_size_inches(DOUBLE, 2.3)
+    methods = list(dict.fromkeys(s["method"] for s in figure.data["series"]))
+    paper.set_size_inches(DOUBLE, 2.2 + 0.13 * -(-len(methods) // ABREAST))
     keys = [key for key in CURVES if any(s["key"] == key for s in figure.data["series"])]
     panels = paper.subplots(1, len(keys), squeeze=False)[0]
     for axes, key in zip(panels, keys, strict=True):
@@ -129,8 +131,7 @@ def curves(paper: Paper, figure: Figure, pictures: Data) -> None:
         axes.set_xlabel("step")
         axes.margins(x=0.01)
         axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
-    methods = list(dict.fromkeys(s["method"] for s in figure.data["series"]))
-    legend(paper, methods, ncols=len(methods))
+    legend(paper, methods, ncols=min(len(methods), ABREAST))
 
 
 MEASURES = {"psnr": "held-out PSNR, dB", "sub_frame_joint_mm": "joints within the readout, mm"}

@@ -22,6 +22,8 @@ Data = Mapping[str, Any]
 LARGEST_ERROR = 0.3  # of the range of a byte: the top of the error maps' scale
 ZOOM = "#ffb000"  # frame of what is enlarged: seen on skin, cloth and white alike
 TITLE, GAP, FOOT = 0.19, 0.035, 0.2  # inches: above a column, between cells, below error maps
+LINE_HEIGHT = 0.12  # inches that a second line of a title adds
+MOST_ON_ONE_LINE = 4  # methods whose names fit beside one another without folding
 EDGE = 0.01  # inches: half a frame's line, so that none is cut
 CHART = 1.9  # inches of the sweep's height
 WIDE = DOUBLE - 2 * EDGE
@@ -92,17 +94,19 @@ def strip(paper: Paper, figure: Figure, pictures: Data) -> None:
     shape = pictures["truth"].shape
     width = (WIDE - GAP * (len(columns) + 1)) / (len(columns) + 2)
     tall = width * shape[0] / shape[1]
-    second, third = TITLE + tall + GAP, TITLE + tall + width + 2 * GAP
+    folds = len(columns) > MOST_ON_ONE_LINE
+    head = TITLE + LINE_HEIGHT * folds
+    second, third = head + tall + GAP, head + tall + width + 2 * GAP
     sheet = Sheet.of(paper, WIDE, third + width + FOOT)
-    seen = sheet.picture((0, TITLE, width, tall), pictures["input"])
+    seen = sheet.picture((0, head, width, tall), pictures["input"])
     seen.set_title("RS input", color=OTHER.light, fontsize=7.5, pad=3)
     _row_clock(seen)
     x0, y0, x1, y1 = pictures["box"]
     cut = np.s_[y0:y1, x0:x1]
     for i, (key, title, colour, weight) in enumerate(_titles(columns), 1):
         left = i * (width + GAP)
-        top = sheet.picture((left, TITLE, width, tall), pictures[key])
-        top.set_title(title, color=colour, fontsize=7.5, fontweight=weight, pad=3)
+        top = sheet.picture((left, head, width, tall), pictures[key])
+        top.set_title(_folded(title) if folds else title, color=colour, fontsize=7.5, fontweight=weight, pad=3)
         outline(top, pictures["box"], shape)
         bare(sheet.picture((left, second, width, width), pictures[key][cut]), ZOOM, 1.1)
         if key != "truth":
@@ -111,7 +115,7 @@ def strip(paper: Paper, figure: Figure, pictures: Data) -> None:
             error.set_xlabel(f"{pictures[f'psnr:{key}']:.2f} dB", fontsize=7, labelpad=2.5, color=colour, weight=weight)
     for place, words in ((second, "enlarged"), (third, "error")):
         _aside(sheet, place, width, words)
-    _scale(sheet, (WIDE - width, third), error)
+    _scale(sheet, (WIDE - width, third), min(0.75, width - 0.2), error)
 
 
 def _titles(columns: Sequence[Data]) -> list[tuple[str, str, str, str]]:
@@ -120,6 +124,11 @@ def _titles(columns: Sequence[Data]) -> list[tuple[str, str, str, str]]:
         (c["job"], c["label"], look_of(c["method"]).light, "bold" if c["method"] == OURS else "normal") for c in columns
     ]
     return [*named, ("truth", "Ground truth", INK, "normal")]
+
+
+def _folded(title: str) -> str:
+    """A method's name on two lines."""
+    return title.replace(" + ", " +\n").replace(" (", "\n(")
 
 
 def _aside(sheet: Sheet, top: float, width: float, words: str) -> None:
@@ -136,9 +145,9 @@ def _row_clock(axes: Axes) -> None:
     axes.text(0.08, 0.5, "rows are read", rotation=90, ha="left", va="center", fontsize=6, color=SOFT)
 
 
-def _scale(sheet: Sheet, place: tuple[float, float], error: Axes) -> None:
+def _scale(sheet: Sheet, place: tuple[float, float], height: float, error: Axes) -> None:
     """The colour scale of the error maps, under the truth."""
-    bar = sheet.paper.colorbar(error.images[0], cax=sheet.cell(place[0] + 0.1, place[1] + 0.2, 0.1, 0.75))
+    bar = sheet.paper.colorbar(error.images[0], cax=sheet.cell(place[0] + 0.1, place[1] + 0.2, 0.1, height))
     bar.outline.set_linewidth(0.4)
     bar.set_ticks([0, LARGEST_ERROR / 2, LARGEST_ERROR], labels=["0", "15 %", "30 %"])
     bar.ax.tick_params(labelsize=6.5, length=2)
