@@ -113,14 +113,15 @@ def _with_method(lines: Sequence[Line], metrics: Sequence[Metric]) -> tuple[list
     everyone = frozenset(subject for line in lines for subject in line.subjects)
     complete = [line.subjects == everyone for line in lines]
     names = _names(lines)
-    cells, notes = [], []
+    cells: list[tuple[Cell, ...]] = []
+    lack: dict[str, list[str]] = {}
     for line, name, whole, own in zip(lines, names, complete, measured(lines, metrics, complete), strict=True):
         cells.append((words(name + ("" if whole else " †"), line.method), *own))
         if not whole:
             lacking = ", ".join(sorted(everyone - line.subjects))
             mean = f"mean over {len(line.subjects)} of {len(everyone)} subjects"
-            notes.append(f"† {name}: {mean}, without {lacking}.")
-    return cells, notes
+            lack.setdefault(f"{mean}, without {lacking}.", []).append(name)
+    return cells, [f"† {'; '.join(names)}: {said}" for said, names in lack.items()]
 
 
 def _names(lines: Sequence[Line]) -> list[str]:
