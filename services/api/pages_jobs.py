@@ -10,6 +10,7 @@ from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse
 from pydantic import BaseModel, ConfigDict, Field
 
+from rsavatar.spec import Preset
 from services.api.deps import UUID, Back, Backend
 from services.api.form import fields_of_spec
 from services.api.layout import PageRoute, page
@@ -22,7 +23,15 @@ from services.store.records import Filters, Job, State, TableEntry
 
 SHOWN = 50
 MOST_COMPARED = 6
-COMPARED_METRICS = ("psnr", "ssim", "flip", "lpips", "joint_mm", "joint_deg", "sub_frame_joint_mm")
+COMPARED_METRICS = {
+    "psnr": "PSNR, dB",
+    "ssim": "SSIM",
+    "flip": "ꟻLIP",
+    "lpips": "LPIPS",
+    "joint_mm": "joints, mm",
+    "joint_deg": "joints, degrees",
+    "sub_frame_joint_mm": "sub-frame joints, mm",
+}
 SortKey = Literal["submitted", "method", "subject", "state", "psnr", "gaussians", "seconds"]
 COLUMNS: tuple[tuple[str, SortKey | None, bool], ...] = (  # title, sort key, whether it holds numbers
     ("Job", "submitted", False),
@@ -84,10 +93,13 @@ def list_page(request: Request, back: Back, query: Annotated[ListQuery, Query()]
 
 @router.get("/new", response_class=HTMLResponse)
 def form_page(
-    request: Request, back: Back, source: Annotated[str | None, Query(alias="from", pattern=UUID)] = None
+    request: Request,
+    back: Back,
+    source: Annotated[str | None, Query(alias="from", pattern=UUID)] = None,
+    preset: Preset = "draft",
 ) -> HTMLResponse:
-    """The form, empty or filled with another job's spec."""
-    given: Mapping[str, Any] = {} if source is None else jobs.get(back.store, source).spec
+    """The form, with a preset chosen or filled with another job's spec."""
+    given: Mapping[str, Any] = {"preset": preset} if source is None else jobs.get(back.store, source).spec
     context = {"form": fields_of_spec(given), "given": given, "source": source, "subjects": subjects.all_of(back.store)}
     return page(request, "new.html", context)
 
@@ -104,6 +116,7 @@ def compare_page(request: Request, back: Back, id: Annotated[list[str], Query(ma
         "jobs": chosen,
         "results": results,
         "differences": differences(chosen),
+        "titles": COMPARED_METRICS,
         "metrics": [row for name in COMPARED_METRICS if (row := _metric(name, chosen, results))],
         "pair": _pair(back, chosen, results),
     }
