@@ -22,6 +22,7 @@ TITLES = {
     "growth": "Growth",
     "train": "Quality against time",
     "stability": "Stability",
+    "service": "Service",
 }
 
 router = APIRouter(route_class=PageRoute, prefix="/benchmarks")

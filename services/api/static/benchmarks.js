@@ -1,5 +1,5 @@
 // Charts of stored benchmark results.
-import { draw, redraw } from "./charts.js";
+import { colour, draw, redraw } from "./charts.js";
 
 const data = JSON.parse(document.querySelector("[data-data]")?.textContent ?? "{}");
 
@@ -40,10 +40,9 @@ function growth(root, result) {
 }
 
 function train(root, result) {
-  for (const [subject, curves] of by(result.curves ?? result.runs ?? [], (c) => c.subject ?? "")) {
-    const place = chart(root, `Held-out PSNR against seconds${subject ? `, ${subject}` : ""}`);
-    const dots = (c) => c.points.map((p) => (Array.isArray(p) ? { x: p[0], y: p[1] } : { x: p.seconds ?? p.x, y: p.psnr ?? p.psnr_db ?? p.y }));
-    draw(place, curves.map((c) => ({ x: dots(c).map((p) => p.x), y: dots(c).map((p) => p.y), name: c.method ?? c.name, mode: "lines" })), { x: { title: { text: "seconds of training" } }, y: { title: { text: "PSNR, dB" } } });
+  for (const { subject, curves } of result.subjects) {
+    const place = chart(root, `Held-out PSNR against seconds, ${subject}`);
+    draw(place, curves.map((c) => ({ x: c.seconds, y: c.psnr_db, name: c.method, mode: "lines+markers", line: { color: colour(c.method) } })), { x: { title: { text: "seconds of training" } }, y: { title: { text: "PSNR, dB" } } });
   }
 }
 

@@ -6,7 +6,7 @@ const root = document.querySelector("[data-curves]");
 const ids = JSON.parse(root.dataset.curves), names = JSON.parse(root.dataset.names), methods = JSON.parse(root.dataset.methods);
 const titles = { psnr: "PSNR of the training view, dB", loss: "Loss", gaussians: "Gaussians" };
 const found = new Map(); // key -> job id -> points
-const box = { width: 520, height: 210, left: 46, right: 8, top: 8, bottom: 24 };
+const box = { width: 380, height: 165, left: 40, right: 14, top: 8, bottom: 24 };
 let waiting = false;
 
 function smooth(points) { // a mean over neighbours: one step sees one picture, so raw values jump

@@ -24,7 +24,7 @@ function parallel() {
   const done = data.jobs.filter((job) => job.metrics[metric()] !== null);
   if (!done.length || all.length < 2) { place.textContent = "The lines appear with the first results."; place.className = "parallel quiet"; return; }
   place.className = "parallel";
-  const width = Math.max(place.clientWidth, 150 * all.length), height = 340, left = 70, right = 70, top = 40, bottom = 20;
+  const width = Math.max(place.clientWidth, 150 * all.length), height = 340, left = 12, right = 70, top = 40, bottom = 20;
   const x = (i) => left + (i * (width - left - right)) / (all.length - 1);
   const y = (axis, job) => {
     const value = axis.of(job);
@@ -39,7 +39,7 @@ function parallel() {
     svg.append(path);
   }
   all.forEach((axis, i) => {
-    const end = i === all.length - 1 ? "end" : i ? "middle" : "start", shift = i === all.length - 1 ? 60 : i ? 0 : -60;
+    const end = i === all.length - 1 ? "end" : i ? "middle" : "start", shift = i === all.length - 1 ? 60 : 0;
     svg.append(node("line", { x1: x(i), x2: x(i), y1: top, y2: height - bottom }), node("text", { class: "axis-name", x: x(i) + shift, y: 16, "text-anchor": end }, axis.name));
     if (!axis.values) for (const [value, at] of [[axis.high, axis.less ? height - bottom : top], [axis.low, axis.less ? top : height - bottom]]) svg.append(node("text", { x: x(i) + 8, y: at + 4 }, kilo(value)));
     else axis.values.forEach((value, k) => {

@@ -4,6 +4,7 @@ import { kilo, line, node, slug, ticks } from "./plot.js";
 
 const root = document.querySelector("[data-motion]");
 const find = (name) => root.querySelector(`[data-${name}]`);
+const slim = matchMedia("(max-width: 46rem)");
 const box = { width: 760, height: 300, left: 50, right: 10, top: 10, bottom: 34 };
 const shown = { camera: null, frame: 0 };
 let data = null, shutter = [];
@@ -29,6 +30,7 @@ function held(found, frame, joint, axis) { // bands: each holds one instant; blu
 }
 
 function drawTime() {
+  box.width = slim.matches ? 380 : 760;
   const joint = Number(find("joint").value), axis = Number(find("axis").value), svg = find("time");
   const pick = (all) => all.map((frame) => frame.map((sample) => sample[joint][axis]));
   const found = pick(data.found), truth = data.truth && pick(data.truth);
@@ -116,6 +118,7 @@ async function start() {
   find("joint").onchange = find("axis").onchange = draw;
   legend();
   document.addEventListener("rs:view", (event) => { Object.assign(shown, event.detail); draw(); });
+  slim.addEventListener("change", draw);
   draw();
 }
 
