@@ -25,9 +25,24 @@ from services.bench.browser import HOW_TO_GET_ONE, open_browser
 FLAGS = ("--hide-scrollbars", "--force-device-scale-factor=1")
 WIDTHS = {"wide": 1440, "narrow": 390}
 SCHEMES = ("light", "dark")
-TALLEST = 6000
+TALLEST = 12000
+COMPARED = ("gauhuman", "rs-avatar", "mad-avatar", "oracle")
 QUALITY = 84  # of a stored picture
 NOBODY = "00000000-0000-0000-0000-000000000000"
+PATIENCE = 60.0  # seconds that a page may take to draw itself
+CALM = 1.0  # seconds without anything left to load
+LEFT = """
+for (const image of document.images) image.loading = 'eager';
+const seen = (all) => [...document.querySelectorAll(all)].filter((node) => node.checkVisibility());
+const images = seen('img').filter((image) => !image.complete || !image.naturalWidth || image.matches('.stale'));
+const words = seen('[role=status], [role=log]').filter((node) => node.textContent.trim().endsWith('…'));
+const blank = ['curves', 'time', 'overlay', 'log'].map((name) => `[data-${name}]:empty`);
+const nodes = [...images, ...words, ...seen(['.chart:not(:has(.main-svg))', ...blank].join())];
+const left = nodes.map((node) => node.alt || node.textContent.trim() || node.outerHTML.slice(0, 60));
+if (document.readyState !== 'complete') left.push('the page itself');
+if (document.fonts.status !== 'loaded') left.push('fonts');
+return left;
+"""
 DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 
 
@@ -43,14 +58,14 @@ def pages(base: str, subject: str) -> dict[str, str]:
     found |= {
         "benchmarks": "/benchmarks",
         "subjects": "/subjects",
-        "error": "/jobs/00000000-0000-0000-0000-000000000000",
+        "error": f"/jobs/{NOBODY}",
     }
     done = ask(f"{base}/api/v1/jobs?state=succeeded&subject={subject}&sort=-psnr&limit=200")["items"]
     best = {job["method"]: job["id"] for job in reversed(done)}
     if "rs-avatar" in best:
         found |= {"job": f"/jobs/{best['rs-avatar']}", "viewer": f"/jobs/{best['rs-avatar']}/viewer"}
-    if len(best) > 1:
-        found["compare"] = "/jobs/compare?" + "&".join(f"id={job}" for job in list(best.values())[:4])
+    if len(compared := [best[method] for method in COMPARED if method in best]) > 1:
+        found["compare"] = "/jobs/compare?" + "&".join(f"id={job}" for job in compared)
     if grids := ask(f"{base}/api/v1/grids?limit=1")["items"]:
         found["grid"] = f"/grids/{grids[0]['id']}"
     return found
@@ -62,16 +77,31 @@ def shoot(driver: webdriver.Chrome, url: str, width: int, scheme: str, path: Pat
     driver.execute_cdp_cmd("Emulation.setEmulatedMedia", emulation)
     _size(driver, width, 900)
     driver.get(url)
-    time.sleep(2.0)
+    wait(driver, path.stem)
     height = driver.execute_script("return document.documentElement.scrollHeight")
     wide = driver.execute_script("return document.documentElement.scrollWidth")
     if wide > width:
         print(f"  {path.stem}: scrolls sideways, {wide} px of {width}")
+    if height > TALLEST:
+        print(f"  {path.stem}: cut, {height} px of {TALLEST}")
     _size(driver, width, min(int(height), TALLEST))
-    time.sleep(1.0)
+    wait(driver, path.stem)
     path.parent.mkdir(parents=True, exist_ok=True)
     picture = Image.open(io.BytesIO(driver.get_screenshot_as_png())).convert("RGB")
     picture.save(path, quality=QUALITY, method=6) if path.suffix == ".webp" else picture.save(path)
+
+
+def wait(driver: webdriver.Chrome, name: str) -> None:
+    """Until nothing has been left to load for a moment; says what is still missing when patience ends."""
+    end = time.monotonic() + PATIENCE
+    calm = time.monotonic()
+    while time.monotonic() < calm + CALM:
+        if left := driver.execute_script(LEFT):
+            calm = time.monotonic()
+        if left and calm > end:
+            print(f"  {name}: not there after {PATIENCE:g} s: {'; '.join(left)}")
+            return
+        time.sleep(0.2)
 
 
 def _size(driver: webdriver.Chrome, width: int, height: int) -> None:
