@@ -88,7 +88,7 @@ int rs_render(RsFrame *frame, const RsGaussians *g, const float *pose, int slots
     clear_uncovered(*frame, rgb, transmittance);
     raster(*frame, rgb, transmittance);
     *counters = {};
-    for (int t = 0; t < slots; t++) counters->splats += frame->slots[t].ids.size(), counters->pairs += frame->slots[t].entry_pair.size(), counters->broken += frame->slots[t].broken;
+    for (int t = 0; t < slots; t++) counters->splats += frame->slots[t].ids.size(), counters->pairs += frame->slots[t].entries.size(), counters->broken += frame->slots[t].broken;
     return 0;
 } catch (const std::bad_alloc &) {
     return 1;

@@ -53,45 +53,6 @@ static Splat pack(const RsFrame &frame, const Slot &slot, const Projected &p, in
     return s;
 }
 
-constexpr int64_t MOST_MOVES = 64;  // per splat; merging costs about as much
-
-static void merge(const std::vector<float> &key, int32_t *entry, int32_t *pair) {
-    struct Entry {
-        float key;
-        int32_t splat, pair;
-    };
-    std::vector<Entry> all(key.size());
-    for (size_t i = 0; i < all.size(); i++) all[i] = {key[i], entry[i], pair[i]};
-    std::stable_sort(all.begin(), all.end(), [](const Entry &a, const Entry &b) { return a.key < b.key; });
-    for (size_t i = 0; i < all.size(); i++) entry[i] = all[i].splat, pair[i] = all[i].pair;
-}
-
-// Within the strip, depth is z + dz/dtau (tau of the strip's middle - own tau): nearly the order that is there already,
-// so insertion sort, which is stable; where it is not (splats that fly past each other), a merge sort goes on from there.
-void resort(const RsFrame &frame, Slot &slot, int strip) {
-    if (slot.rows.rate == 0.f || frame.options.flags & RS_NO_RESORT) return;
-    int r0 = slot.rows.lo + strip * frame.options.strip_rows, r1 = std::min(r0 + frame.options.strip_rows, slot.rows.hi);
-    float tau = slot.rows.rate * 0.5f * (r0 + r1) + slot.rows.start;
-    int begin = slot.strip_begin[strip], n = slot.strip_begin[strip + 1] - begin;
-    int32_t *entry = slot.entry_splat.data() + begin, *pair = slot.entry_pair.data() + begin;
-    static thread_local std::vector<float> key;
-    key.resize(n);
-    for (int i = 0; i < n; i++) {
-        const Splat &s = slot.splats[entry[i]];
-        key[i] = s.depth + s.depth_rate * (tau - s.tau);
-    }
-    int64_t moves = 0;
-    for (int i = 0; i < n && moves <= MOST_MOVES * n; i++) {
-        float k = key[i];
-        int32_t e = entry[i], q = pair[i];
-        int j = i;
-        for (; j > 0 && key[j - 1] > k; j--) key[j] = key[j - 1], entry[j] = entry[j - 1], pair[j] = pair[j - 1];
-        key[j] = k, entry[j] = e, pair[j] = q;
-        moves += i - j;
-    }
-    if (moves > MOST_MOVES * n) merge(key, entry, pair);
-}
-
 void bin(RsFrame &frame, int index, int count, const Projected &p) {
     Slot &slot = frame.slots[index];
     cull(frame, slot, count, p);
@@ -114,14 +75,12 @@ void bin(RsFrame &frame, int index, int count, const Projected &p) {
     if (pairs > INT32_MAX) throw std::bad_alloc();  // 128 GiB of moments
     slot.first_pair[n] = pairs;
     for (int strip = 0; strip < slot.strips; strip++) slot.strip_begin[strip + 1] += slot.strip_begin[strip];
-    slot.entry_splat.resize(pairs), slot.entry_pair.resize(pairs);
+    slot.entries.resize(pairs);
     static thread_local std::vector<int32_t> fill;
     fill.assign(slot.strip_begin.begin(), slot.strip_begin.end() - 1);
     for (int k = 0; k < n; k++) {
         int strip = (slot.splats[k].y_lo - lo) / height;
-        for (int pair = slot.first_pair[k]; pair < slot.first_pair[k + 1]; pair++, strip++) {
-            int at = fill[strip]++;
-            slot.entry_splat[at] = k, slot.entry_pair[at] = pair;
-        }
+        for (uint32_t pair = slot.first_pair[k]; pair < (uint32_t)slot.first_pair[k + 1]; pair++, strip++)
+            slot.entries[fill[strip]++] = {k, pair, 0};
     }
 }

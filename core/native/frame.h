@@ -19,6 +19,16 @@ struct alignas(64) Splat {
 };
 static_assert(sizeof(Splat) == 64, "one cache line");
 
+// A splat in a strip's list; `pair` is where its moments lie. Tied to the entry before it: see order.h.
+struct Entry {
+    int32_t splat;
+    uint32_t pair : 31, tied : 1;
+};
+
+struct Rows {
+    int lo, hi;
+};
+
 // Gradient of one splat; the sums over pixels that everything else follows from. g = dL/dalpha * alpha at a pixel, its
 // coordinates x = dx + tilt dy and y = dy.
 enum Moment { M0, MX, MY, MXX, MXY, MYY, MR, MG, MB, MOMENTS };
@@ -39,7 +49,7 @@ struct Slot {
     std::vector<int32_t> first_pair;   // splat -> its first pair; a splat's pairs are its strips, from the top; [n + 1]
     std::vector<int32_t> strip_begin;  // strip -> its first entry; [strips + 1]
     std::vector<int16_t> strip_x_lo, strip_x_hi;  // columns that the strip's splats reach
-    std::vector<int32_t> entry_splat, entry_pair;  // the strips' lists, by depth
+    std::vector<Entry> entries;        // the strips' lists, by depth
     std::vector<float> moments;        // [pairs][16], written by the backward raster
     std::vector<uint32_t> keys, keys2;
     std::vector<int32_t> order, order2;
@@ -61,6 +71,11 @@ struct RsFrame {
     std::vector<float> pose_sums;      // [chunks][T][D * 24 * 12]
 };
 
+static inline Rows rows_of(const RsFrame &frame, const Slot &slot, int strip) {
+    int lo = slot.rows.lo + strip * frame.options.strip_rows;
+    return {lo, lo + frame.options.strip_rows < slot.rows.hi ? lo + frame.options.strip_rows : slot.rows.hi};
+}
+
 // A slot's projected Gaussians before culling, structure of arrays.
 struct Projected {
     float *base;
@@ -70,7 +85,7 @@ struct Projected {
 
 void project(const RsFrame &frame, const RsGaussians &gaussians, const float *pose, int slot, int begin, int end, const Projected &out);
 void bin(RsFrame &frame, int slot, int count, const Projected &projected);
-void resort(const RsFrame &frame, Slot &slot, int strip);
+void order(const RsFrame &frame, Slot &slot, int strip);
 void raster(RsFrame &frame, float *rgb, float *transmittance);
 void raster_backward(RsFrame &frame, const float *rgb, const float *transmittance, const float *grad_rgb,
                      const float *grad_transmittance);

@@ -1,7 +1,7 @@
 // Strips of rows, splat by splat, front to back, LANES pixels at a time; and the same walk again for the gradient.
 #include <algorithm>
 
-#include "frame.h"
+#include "order.h"
 
 static const Floats CENTRES = [] {
     Floats v;
@@ -16,6 +16,12 @@ struct Canvas {
     float *data;
 
     float *at(int y, int x) const { return data + (y - r0) * row + (x - x0); }
+
+    Canvas part(int lo, int hi) const {
+        Canvas c = *this;
+        c.r0 = lo, c.r1 = hi, c.data = at(lo, x0);
+        return c;
+    }
 };
 
 enum { T_PLANE, R_PLANE, G_PLANE, B_PLANE, FORWARD_PLANES };                    // forward
@@ -23,7 +29,8 @@ enum { REST_PLANE = 1, GR_PLANE, GG_PLANE, GB_PLANE, BACKWARD_PLANES };         
 
 static Canvas open_canvas(const RsFrame &frame, const Slot &slot, int strip, int planes, std::vector<float> &buffer) {
     Canvas c;
-    c.r0 = slot.rows.lo + strip * frame.options.strip_rows, c.r1 = std::min(c.r0 + frame.options.strip_rows, slot.rows.hi);
+    const Rows rows = rows_of(frame, slot, strip);
+    c.r0 = rows.lo, c.r1 = rows.hi;
     c.x0 = slot.strip_x_lo[strip], c.x1 = slot.strip_x_hi[strip];
     if (c.x0 >= c.x1) c.x0 = c.x1 = 0;
     c.plane = (c.x1 - c.x0 + 2 * LANES - 1) / LANES * LANES;  // a vector may start at the last column
@@ -100,8 +107,7 @@ static void blend_strip(const RsFrame &frame, const Slot &slot, int strip, const
         float *t = c.at(y, c.x0);
         std::fill(t, t + c.plane, 1.f), std::fill(t + c.plane, t + FORWARD_PLANES * c.plane, 0.f);
     }
-    for (int e = slot.strip_begin[strip]; e < slot.strip_begin[strip + 1]; e++)
-        walk<Blend>(slot.splats[slot.entry_splat[e]], c, limits);
+    each_in_order(slot, strip, {c.r0, c.r1}, [&](Entry e, int lo, int hi) { walk<Blend>(slot.splats[e.splat], c.part(lo, hi), limits); });
 }
 
 // weight * canvas, on rows of the image: the first slot of a group sets them, the others add.
@@ -131,7 +137,7 @@ void raster(RsFrame &frame, float *rgb, float *transmittance) {
             for (int k = 0; k < group.slots; k++) {
                 Slot &slot = frame.slots[group.first_slot + k];
                 const int strip = frame.tasks[task].second;
-                resort(frame, slot, strip);
+                order(frame, slot, strip);
                 Canvas c = open_canvas(frame, slot, strip, FORWARD_PLANES, buffer);
                 blend_strip(frame, slot, strip, c);
                 emit(frame, c, slot.rows.weight, k == 0, rgb, transmittance);
@@ -167,7 +173,7 @@ static void open_gradient(const RsFrame &frame, const Slot &slot, const Canvas &
     }
 }
 
-// Moments of one splat over one strip. dL/dalpha = T (c . g) - rest_after / (1 - alpha).
+// Adds the moments of one splat over a canvas. dL/dalpha = T (c . g) - rest_after / (1 - alpha).
 template <int N> struct Moments {
     static void run(const Splat splat, const Canvas &c, const Limits &limits, float *out) {
         const int y1 = std::min<int>(c.r1, splat.y_hi), x0 = splat.x_lo, vectors = N ? N : (splat.x_hi - x0 + LANES - 1) / LANES;
@@ -193,13 +199,16 @@ template <int N> struct Moments {
         }
         const Floats all[MOMENTS] = {m0, mx, my, mxx, mxy, myy, mr, mg, mb};
         static_assert(MOMENTS == 9, "eight and one");
-        sum_eight(all, out), out[8] = sum(all[8]);
+        float eight[8];
+        sum_eight(all, eight);
+        for (int i = 0; i < 8; i++) out[i] += eight[i];
+        out[8] += sum(all[8]);
     }
 };
 
 void raster_backward(RsFrame &frame, const float *rgb, const float *transmittance, const float *grad_rgb, const float *grad_transmittance) {
     int tasks = frame.tasks.size();
-    for (int t = 0; t < frame.slot_count; t++) frame.slots[t].moments.resize(frame.slots[t].entry_pair.size() * 16);
+    for (int t = 0; t < frame.slot_count; t++) frame.slots[t].moments.resize(frame.slots[t].entries.size() * 16);
     const Limits limits(frame.options);
     Attempt attempt;
 #pragma omp parallel num_threads(frame.options.threads)
@@ -218,8 +227,11 @@ void raster_backward(RsFrame &frame, const float *rgb, const float *transmittanc
                     blend_strip(frame, slot, strip, own);
                 }
                 open_gradient(frame, slot, c, averaged ? &own : nullptr, rgb, transmittance, grad_rgb, grad_transmittance);
-                for (int e = slot.strip_begin[strip]; e < slot.strip_begin[strip + 1]; e++)
-                    walk<Moments>(slot.splats[slot.entry_splat[e]], c, limits, &slot.moments[(size_t)slot.entry_pair[e] * 16]);
+                auto moments = [&slot](Entry e) { return &slot.moments[(size_t)e.pair * 16]; };
+                for (int e = slot.strip_begin[strip]; e < slot.strip_begin[strip + 1]; e++) std::fill_n(moments(slot.entries[e]), 16, 0.f);
+                each_in_order(slot, strip, {c.r0, c.r1}, [&](Entry e, int lo, int hi) {
+                    walk<Moments>(slot.splats[e.splat], c.part(lo, hi), limits, moments(e));
+                });
             }
         });
     }

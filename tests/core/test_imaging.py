@@ -71,6 +71,6 @@ def test_a_cut_image_is_the_cut_of_the_image(shutter: AbstractShutter) -> None:
         whole = expose(actor.scene(1, camera, plan(slots, 0, 40), weights, 1))
         part = expose(actor.scene(1, camera.cropped(6, 8, 35, 33), plan(slots, 8, 33), weights, 1))
     assert whole.transmittance.min() < 0.5
-    # the two differ by the polynomial through other nodes and by the strips' depth order
+    # the two differ by the polynomial through other nodes
     assert (whole.rgb[:, 8:33, 6:35] - part.rgb).abs().max() < 0.02
     assert (whole.rgb[:, 8:33, 6:35] - part.rgb).square().mean() < 1e-6

@@ -11,7 +11,7 @@ from torch import Tensor
 from rsavatar import kernels
 from rsavatar.errors import KernelError
 from rsavatar.render import native, reference
-from rsavatar.render.base import Gaussians, Rendering, Scene, TimedRows
+from rsavatar.render.base import Gaussians, Options, Rendering, Scene, TimedRows
 from tests.core import scenes
 
 pytestmark = pytest.mark.skipif(not kernels.available(), reason="no native kernels were built for this machine")
@@ -64,6 +64,27 @@ def test_any_number_of_threads_gives_the_same_bits(kind: str) -> None:
     for image, grads in runs[1:]:
         assert torch.equal(image.rgb, runs[0][0].rgb)
         assert all(torch.equal(grads[name], runs[0][1][name]) for name in grads)
+
+
+@pytest.mark.parametrize("kind", ["scanline", "exposed"])
+@pytest.mark.parametrize("speed", [0.05, 2.0], ids=["few swaps", "more swaps than insertion sorts"])
+def test_every_row_has_its_own_depth_order(kind: str, speed: float) -> None:
+    """Splats that fly past each other: strips of any height give the image of strips of one row."""
+    s = scenes.scene(kind, count=400, dtype=torch.float32)
+    pose = s.pose.clone()
+    pose[:, 1, :12, 2, 3] += speed
+    pose[:, 1, 12:, 2, 3] -= speed
+
+    def drawn(options: Options) -> tuple[Rendering, dict[str, Tensor]]:
+        return gradients(native.render, replace(s, pose=pose, options=options))
+
+    rows, wanted = drawn(Options(strip_rows=1))
+    for height in (7, 16, scenes.HEIGHT):
+        image, got = drawn(Options(strip_rows=height))
+        assert torch.equal(image.rgb, rows.rgb)
+        assert all((got[name] - g).norm() < 1e-5 * g.norm() for name, g in wanted.items())
+    one_order, _ = drawn(Options(without=frozenset({"resort"})))
+    assert (one_order.rgb - rows.rgb).abs().max() > 0.1
 
 
 def test_gradients_that_nobody_wants_are_not_computed() -> None:

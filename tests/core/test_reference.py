@@ -235,10 +235,11 @@ def test_overlapping_slots_add_by_weight() -> None:
     torch.testing.assert_close(both.transmittance, expected, atol=ROUNDING, rtol=0)
 
 
-def test_strips_only_bound_the_work_of_an_instant() -> None:
-    """Strips decide what is culled and sorted together; without a readout neither may show."""
+@pytest.mark.parametrize("rows", [NO_READOUT, WHOLE], ids=["instant", "scanline"])
+def test_strips_only_bound_the_work(rows: TimedRows) -> None:
+    """Strips decide what is culled and drawn together, which may not show."""
     cloud = random_gaussians(60)
-    images = [render(scene(cloud, still(), NO_READOUT, Options(strip_rows=n))) for n in (1, 5, 16, 100)]
+    images = [render(scene(cloud, turning(), rows, Options(strip_rows=n))) for n in (1, 5, 16, 100)]
     for image in images[1:]:
         torch.testing.assert_close(image.rgb, images[0].rgb, atol=ROUNDING, rtol=0)
 
@@ -305,10 +306,9 @@ def test_articulated_motion_in_one_scan_beats_a_render_per_three_rows() -> None:
 def test_scanline_error_falls_with_the_motion() -> None:
     """What is left is the change of shape and colour while a footprint is scanned: first order, 6 dB per halving."""
     cloud, scores = random_gaussians(60), []
-    options = replace(SMOOTH, strip_rows=1)
     for speed in (0.1, 0.05, 0.025):
         pose = turning(speed=speed)
-        scores.append(psnr(render(scene(cloud, pose, WHOLE, options)), brute_force(speed, SMOOTH)))
+        scores.append(psnr(render(scene(cloud, pose, WHOLE, SMOOTH)), brute_force(speed, SMOOTH)))
     assert float(np.diff(scores).min()) > 5.5
     assert scores[0] > 55  # measured
 
@@ -341,18 +341,18 @@ def test_upward_readout_of_the_mirrored_motion_is_the_downward_readout() -> None
     torch.testing.assert_close(up.rgb, down.rgb, atol=1e-10, rtol=0)
 
 
-def test_strips_order_depths_at_their_own_instants() -> None:
+def test_rows_order_depths_at_their_own_instants() -> None:
     """Two discs side by side in depth change places in mid-readout: above one is in front, below the other."""
     pair = gaussians(double([0, 0], [0, 0], [2, 2]), scale=1.0, opacity=0.9, colours=RED_BLUE)
     pair.skin_weights[:2] = torch.eye(2)
     pose = still(2)
     pose[1, 0, 2, 3], pose[1, 1, 2, 3] = 0.02, -0.02  # red moves away, blue comes nearer
-    image = render(scene(pair, pose, WHOLE, Options(strip_rows=4)))
+    image = render(scene(pair, pose, WHOLE))
     truth = render_rows(pair, row_clock(pose), CAMERA)
     for picture in (image, truth):
         red, _, blue = picture.rgb[:, :, CENTRE[1]]
-        assert bool((red[:10] > 2 * blue[:10]).all())
-        assert bool((blue[-10:] > 2 * red[-10:]).all())
+        assert bool((red[:12] > 2 * blue[:12]).all())
+        assert bool((blue[-12:] > 2 * red[-12:]).all())
 
 
 # --- gradients --------------------------------------------------------------------------------------------------------

@@ -25,8 +25,7 @@ in axis-angle; "px of motion" is the path of its fastest Gaussian during the rea
 **Errors** are against a float64 image of which each row is posed and rendered on its own, over the pixels that anything
 was blended into; medians over seeds {seeds}, with the range. "px off" counts pixels that are wrong by more than 1/255
 in the worst seed, and "PSNR of the rest" leaves them out: above 75 dB a PSNR is made by a few dozen pixels where two
-splats lie so close in depth that float32 (2.4e-7 m there), or the one order of a strip of rows, puts the wrong one in
-front.
+splats lie so close in depth that float32 (2.4e-7 m there) puts the wrong one in front.
 
 **Motion gradient**: relative error, against bands with T = H, of the gradient with respect to the spline's control
 points of a fixed linear functional of the image: the one that a squared error against the truth shifted by 3 pixels
@@ -56,9 +55,8 @@ REASONS = {  # why a target is missed, by how its name starts
     "scanline, forward": MILLISECONDS,
     "training step, scanline": MILLISECONDS,
     "20 000 steps": MILLISECONDS,
-    "scanline at 50": "What is left is depth order: of splats closer in depth than float32 resolves, and of a strip's "
-    "rows, which share one order. See the range over seeds, the pixels off, and the row with strips of 4 rows.",
-    "scanline at 200": "A strip's rows share one depth order: see the rows with other strips and what they cost.",
+    "scanline at": "What is left is the order of splats closer in depth than float32 resolves: see the range over "
+    "seeds and the pixels off.",
     "training step, the paper": "What is not rendering (poses, networks, loss, optimiser) costs both ways the same. A "
     "busy machine moves this ratio, too.",
     "memory, last training step": "Most of it comes before step 500; a leak would grow evenly. "

@@ -15,9 +15,7 @@ STEPS: dict[str, tuple[str, tuple[int, int], str]] = {  # of own time: label, it
     "own-time": ("own time", (-6, 0), "right"),
     "own-time+shear": ("+ shear, implicit", (-6, 0), "right"),
     "scanline": ("scanline", (-6, 0), "right"),
-    "scanline-coarse": ("strips of 16 rows", (7, 2), "left"),
-    "scanline-fine": ("strips of 4 rows", (7, -10), "left"),
-    "scanline-row": ("an order for each row", (7, 2), "left"),
+    "scanline-row": ("strips of one row", (7, 2), "left"),
 }
 
 

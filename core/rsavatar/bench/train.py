@@ -188,8 +188,8 @@ def page(result: TrainResult, stem: str = "train") -> str:
         lines += ["", f"## {subject.subject}", "", f"![{subject.subject}]({stem}-{subject.subject}.png)", ""]
         lines += ["| method | steps | seconds | PSNR at 10 s | PSNR at the end |", "|---|---:|---:|---:|---:|"]
         for c in subject.curves:
-            early = np.interp(10.0, c.seconds, c.psnr_db)
-            cells = (c.method, f"{c.steps[-1]}", f"{c.seconds[-1]:.0f}", f"{early:.2f}", f"{c.psnr_db[-1]:.2f}")
+            early = "–" if c.seconds[0] > 10 else f"{np.interp(10.0, c.seconds, c.psnr_db):.2f}"  # –: it still prepares
+            cells = (c.method, f"{c.steps[-1]}", f"{c.seconds[-1]:.0f}", early, f"{c.psnr_db[-1]:.2f}")
             lines.append("| " + " | ".join(cells) + " |")
         ahead = "never" if subject.ahead_from_s is None else f"from {subject.ahead_from_s:.0f} s on"
         lines += ["", f"rs-avatar is above the other learned methods {ahead}."]

@@ -54,10 +54,10 @@ def scan(height: int, name: str = "scanline", label: str = "scanline", *without:
 def all_ways(height: int, K: int) -> list[Way]:
     """Every way for K source frames per frame: T = 1, the paper's, bands from K to H, and own time step by step.
 
-    The last four are the scanline with one thing changed: a pose node less, or other strips.
+    The last two are the scanline with one thing changed: a pose node less, or strips of a single row.
     """
     fewer = replace(scan(height, "scanline-4", "scanline, four pose nodes"), nodes=4)
-    strips = {"coarse": (16, "strips of 16 rows"), "fine": (4, "strips of 4 rows"), "row": (1, "an order for each row")}
+    single = replace(scan(height, "scanline-row", "scanline, strips of one row"), options=Options(strip_rows=1))
     finer = sorted({min(T, height) for T in (K, 2 * K, 4 * K, 16 * K, height)})
     return [
         global_shutter(height),
@@ -67,10 +67,7 @@ def all_ways(height: int, K: int) -> list[Way]:
         scan(height, "own-time+shear", "+ shear, implicit derivative", "resort"),
         scan(height, "scanline", "+ depth re-sort (scanline)"),
         fewer,
-        *(
-            replace(scan(height, f"scanline-{name}", f"scanline, {label}"), options=Options(strip_rows=rows))
-            for name, (rows, label) in strips.items()
-        ),
+        single,
     ]
 
 

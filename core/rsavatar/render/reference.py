@@ -11,8 +11,8 @@ An image is rendered slot by slot (``TimedRows``). For a slot whose row y is exp
 3. **Shear.** Inside its footprint the Gaussian goes on moving: the row dy below the mean is exposed rate dy later, when
    the mean has moved by (a, b) dy, a = rate u', b = rate v'. With dx' = dx - a dy and dy' = (1 - b) dy the exponent
    A dx'^2 + 2 B dx' dy' + C dy'^2 is again a quadratic form in (dx, dy): only the conic changes.
-4. **Depth order.** Gaussians are posed at different instants, so each strip of rows orders them by their depths
-   extrapolated to the strip's own instant.
+4. **Depth order.** Gaussians are posed at different instants, so each row orders them by their depths extrapolated to
+   the row's own instant.
 5. **Composite.** Front to back, alpha blending with 3D Gaussian splatting's cutoffs (``Options``).
 
 A slot of rate 0 is the usual renderer: every Gaussian at tau = start, no shear, plain depth order.
@@ -147,9 +147,8 @@ def rasterise(splats: Splats, rows: TimedRows, width: int, options: Options) -> 
     strips = []
     for top in range(rows.lo, rows.hi, options.strip_rows):
         bottom = min(top + options.strip_rows, rows.hi)
-        ordered = splats.take(_depth_order(splats, rows, (top + bottom) / 2, options))
         tiles = [
-            _composite(ordered, (top, bottom), (left, min(left + TILE_COLUMNS, width)), options)
+            _composite(splats, rows, (top, bottom), (left, min(left + TILE_COLUMNS, width)), options)
             for left in range(0, width, TILE_COLUMNS)
         ]
         strips.append(torch.cat(tiles, -1))
@@ -236,22 +235,27 @@ def _colour(sh: Tensor, world: Tensor, camera: Camera) -> Tensor:
     return torch.relu(colour)
 
 
-def _depth_order(splats: Splats, rows: TimedRows, middle: float, options: Options) -> Tensor:
-    """Front to back at the instant when row coordinate ``middle`` is exposed; ties in the order of the index."""
-    depth = splats.depth.detach()
+def _depth_order(splats: Splats, rows: TimedRows, y: Tensor, options: Options) -> Tensor:
+    """Indices [M, rows], front to back when the row coordinates ``y`` are exposed; ties in the order of the index."""
+    depth = splats.depth.detach()[:, None].expand(-1, len(y))
     if rows.rate != 0 and "resort" not in options.without:
-        depth = depth + splats.depth_rate.detach() * (rows.rate * middle + rows.start - splats.tau.detach())
-    return depth.argsort(stable=True)
+        depth = depth + splats.depth_rate.detach()[:, None] * (
+            rows.rate * y + rows.start - splats.tau.detach()[:, None]
+        )
+    return depth.argsort(dim=0, stable=True)
 
 
-def _composite(splats: Splats, rows: tuple[int, int], columns: tuple[int, int], options: Options) -> Tensor:
-    """Red, green, blue and transmittance [4, rows, columns] of the depth-ordered splats in one block of pixels."""
+def _composite(
+    splats: Splats, timed: TimedRows, rows: tuple[int, int], columns: tuple[int, int], options: Options
+) -> Tensor:
+    """Red, green, blue and transmittance [4, rows, columns] of the splats in one block of pixels."""
     splats = splats.take(_touching(splats, rows, columns, options))
     x, y = (splats.u.new_tensor(range(*pixels)) + 0.5 for pixels in (columns, rows))
-    dx, dy = x[None, None, :] - splats.u[:, None, None], y[None, :, None] - splats.v[:, None, None]
-    A, B, C = splats.conic[:, :, None, None]
+    order = _depth_order(splats, timed, y, options)
+    dx, dy = x[None, None, :] - splats.u[order, None], (y - splats.v[order])[:, :, None]
+    A, B, C = splats.conic[:, order, None]
     falloff = torch.exp(-0.5 * (A * dx * dx + 2 * B * dx * dy + C * dy * dy))
-    alpha = splats.opacity[:, None, None] * falloff
+    alpha = splats.opacity[order, None] * falloff
     alpha = torch.where(alpha < options.alpha_min, 0.0, alpha.clamp(max=options.alpha_max))
 
     # A pixel stops for good before its transmittance would fall under the limit. Running products never rise again,
@@ -260,7 +264,7 @@ def _composite(splats: Splats, rows: tuple[int, int], columns: tuple[int, int], 
     alpha = torch.where(going, alpha, 0.0)
     passed = (1 - alpha).cumprod(0)
     transmittance = torch.cat([passed.new_ones(1, *passed.shape[1:]), passed])  # before splat k; the last: after all
-    rgb = torch.einsum("khw,ck->chw", transmittance[:-1] * alpha, splats.colour)
+    rgb = torch.einsum("khw,ckh->chw", transmittance[:-1] * alpha, splats.colour[:, order])
     return torch.cat([rgb, transmittance[-1:]])
 
 
