@@ -107,9 +107,6 @@ def _submit(store: Store, order: Order) -> tuple[Grid, bool, list[str]]:
     with store.write() as session:
         if (known := _known(session, order)) is not None:
             return known, False, []
-        now = session.scalar(select(db_now())) or 0.0
-        asked = order.request.model_dump(mode="json")
-        parts = {name: asked[name] for name in ("name", "base", "axes", "includes", "excludes")}
         refusal = owners.room(session, store, order.owner).take(len(order.cells))
         if refusal is not None:
             raise refusal
