@@ -78,14 +78,15 @@ def shoot(driver: webdriver.Chrome, url: str, width: int, scheme: str, path: Pat
     _size(driver, width, 900)
     driver.get(url)
     wait(driver, path.stem)
-    height = driver.execute_script("return document.documentElement.scrollHeight")
     wide = driver.execute_script("return document.documentElement.scrollWidth")
     if wide > width:
         print(f"  {path.stem}: scrolls sideways, {wide} px of {width}")
+    for _ in range(2):  # some of a page grows with the window
+        height = driver.execute_script("return document.documentElement.scrollHeight")
+        _size(driver, width, min(int(height), TALLEST))
+        wait(driver, path.stem)
     if height > TALLEST:
         print(f"  {path.stem}: cut, {height} px of {TALLEST}")
-    _size(driver, width, min(int(height), TALLEST))
-    wait(driver, path.stem)
     path.parent.mkdir(parents=True, exist_ok=True)
     picture = Image.open(io.BytesIO(driver.get_screenshot_as_png())).convert("RGB")
     picture.save(path, quality=QUALITY, method=6) if path.suffix == ".webp" else picture.save(path)
