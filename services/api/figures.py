@@ -99,6 +99,7 @@ def to_run(entry: TableEntry) -> Run:
         seed=int(spec.get("seed", 0)),
         preset=str(spec.get("preset", "")),
         bands=str(spec.get("T") or "K"),
+        motion=str(spec.get("motion", "")),
         ablation=tuple(flag for flag, is_set in dict(spec.get("ablation") or {}).items() if is_set),
         is_standard=is_standard(dict(spec)),
         iterations=int(spec.get("iterations", 0)),

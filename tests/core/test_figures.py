@@ -33,6 +33,7 @@ def run(method: str = "rs-avatar", subject: str = "walk", psnr: float = 25.0, **
         "seed": 0,
         "preset": "draft",
         "bands": "K",
+        "motion": "sequence-spline",
         "ablation": (),
         "is_standard": True,
         "iterations": 100,
@@ -144,6 +145,14 @@ def test_means_are_over_seeds_then_subjects_with_the_deviation_over_seeds() -> N
 def test_the_front_holds_what_none_beats_in_both_and_never_the_oracle() -> None:
     runs = [*everything(), run("oracle", psnr=40.0, train_seconds=1.0)]
     assert set(build("pareto", runs).data["front"]) == {"gauhuman", "rs-avatar"}
+
+
+def test_an_ablation_is_compared_with_the_same_model_of_motion() -> None:
+    ablated = run(psnr=23.0, motion="frame-spline", ablation=("no_reg",), is_standard=False, number=1)
+    assert build("ablation", [run(psnr=26.0), ablated]).lacking
+    whole = run(psnr=25.0, motion="frame-spline", is_standard=False, number=2)
+    variants = build("ablation", [run(psnr=26.0), ablated, whole]).data["variants"]
+    assert [(v["flag"], v["psnr"]) for v in variants] == [("", 25.0), ("no_reg", 23.0)]
 
 
 def test_an_ablation_is_compared_with_the_whole_method_on_its_subjects_alone() -> None:

@@ -6,6 +6,7 @@ time; what it was made from goes with it, into the file's metadata and the JSON 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
@@ -106,10 +107,12 @@ def _curves(runs: Sequence[Run], wish: Wish) -> Figure:
 
 
 def _ablation(runs: Sequence[Run], wish: Wish) -> Figure:
-    flagged = [run for run in runs if run.method == OURS and len(run.ablation) == 1]
-    whole = [run for run in standard(runs) if run.method == OURS]
-    subjects = {run.subject for run in flagged} & {run.subject for run in whole}
-    used = [run for run in (*whole, *flagged) if run.subject in subjects]
+    own = [run for run in runs if run.method == OURS and len(run.ablation) <= 1]
+    flagged = [run for run in own if run.ablation]
+    model = Counter((run.bands, run.motion) for run in flagged).most_common(1)
+    own = [run for run in own if [(run.bands, run.motion)] == [known for known, _ in model]]
+    subjects = {run.subject for run in own if run.ablation} & {run.subject for run in own if not run.ablation}
+    used = [run for run in own if run.subject in subjects]
     variants = []
     for flag, label in VARIANTS.items():
         own = [run for run in used if ",".join(run.ablation) == flag]
@@ -118,7 +121,8 @@ def _ablation(runs: Sequence[Run], wish: Wish) -> Figure:
             variants.append({"flag": flag, "label": label, "subjects": each, **summary(own)})
     caption = (
         "Each component taken away on its own: held-out PSNR and error of the joints within the readout, mean over "
-        "subjects (small dots). The vertical line is the full method; error bars are the deviation over seeds."
+        "subjects. The vertical line is the full method with the same motion and bands; error bars are the deviation over "
+        "seeds."
     )
     lacking = (
         "" if len(variants) > 1 else "succeeded jobs of rs-avatar on one subject, with and without an ablation flag"
@@ -128,8 +132,10 @@ def _ablation(runs: Sequence[Run], wish: Wish) -> Figure:
 
 def _shutter(runs: Sequence[Run], wish: Wish) -> Figure:
     whole = [run for run in runs if not run.ablation and run.means.get("psnr") is not None]
-    swept = {run.subject for run in whole if run.method == OURS and run.bands != "scanline"}
-    whole = [run for run in whole if run.subject in swept] if swept else whole  # means of equal subjects
+    swept = [run for run in whole if run.method == OURS and run.bands != "scanline"]
+    if swept:  # means of equal subjects, and of one model of motion
+        subjects, motions = {run.subject for run in swept}, {run.motion for run in swept}
+        whole = [r for r in whole if r.subject in subjects and (r.method != OURS or r.motion in motions)]
     modelled = [run for run in whole if run.method in {OURS, "mad-avatar"}]
     sweep = []
     for group in groups(modelled, lambda r: (r.method, r.bands)):

@@ -24,6 +24,7 @@ class Run:
     seed: int
     preset: str
     bands: str  # T: a number, K, or scanline
+    motion: str  # its model: per-frame splines, one spline, ...
     ablation: tuple[str, ...]
     is_standard: bool  # its spec is what the preset says for this method, subject and seed
     iterations: int
