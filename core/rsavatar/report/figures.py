@@ -121,7 +121,7 @@ def _ablation(runs: Sequence[Run], wish: Wish) -> Figure:
             variants.append({"flag": flag, "label": label, "subjects": each, **summary(own)})
     caption = (
         "Each component taken away on its own: held-out PSNR and error of the joints within the readout, mean over "
-        "subjects. The vertical line is the full method with the same motion and bands; error bars: deviation over seeds."
+        "subjects. The vertical line is the full method of the same motion and bands; error bars: deviation of seeds."
     )
     lacking = (
         "" if len(variants) > 1 else "succeeded jobs of rs-avatar on one subject, with and without an ablation flag"
