@@ -78,6 +78,7 @@ def index(request: Request, back: Back, preset: Preset | None = None) -> HTMLRes
     entries = listing.newest_of_specs(back.store, LOOKED_AT)
     presets = findings.presets_of(entries)
     chosen = preset or (presets[0] if presets else "draft")
+    of_preset = [entry for entry in entries if entry.job.spec.get("preset") == chosen]
     found = findings.finding(entries, chosen)
     context = {
         "newest": newest,
@@ -86,7 +87,7 @@ def index(request: Request, back: Back, preset: Preset | None = None) -> HTMLRes
         "finding": found,
         "paper_gain": PAPER_MAIN[findings.OURS]["psnr"] - PAPER_MAIN[findings.BASELINE]["psnr"],
         "pair": _pair(back, found),
-        "table": to_grid(render("main", [to_row(e) for e in entries if e.job.spec.get("preset") == chosen], "md")),
+        "table": to_grid(render("main", [to_row(entry) for entry in findings.plain(of_preset)], "md")),
         "looked_at": LOOKED_AT if counts[State.SUCCEEDED] > LOOKED_AT else None,
         "results": listing.newest_results(back.store, NEWEST),
         **_state(back, counts),
