@@ -35,7 +35,7 @@ sends back.
 with the gradients of all eight inputs of the renderer (poses and skinning weights included), on the whole frame. All
 ways run on the same kernels. "The paper's way" renders {K} whole images and takes a band of rows from each; bands
 render only their own rows; own time poses every Gaussian at the instant when the scan meets it. The torch twin is
-this package's own float64 reference in plain torch, run once: {twin}.
+this package's own float64 reference in plain torch: {twin}.
 """
 GROWTH = """\
 **What is measured.** Scene P13 with one size changed at a time. More Gaussians are smaller ones, so that the body stays
@@ -47,9 +47,8 @@ of the process's resident memory in a process of its own, in forward and backwar
 MILLISECONDS = (
     "Milliseconds are of the processor above under the load above; the ratios are what carries over. The target was "
     "set with prototypes on a processor of 16 lanes; their plain build of 8 lanes takes 34 ms on one thread of an AMD "
-    "EPYC with AVX2, on a scene of its own with fewer pixels. What helped these kernels there: walks unrolled by a "
-    "splat's width, eight sums at once, skinning with its sums in registers, limbs in order, memory kept between "
-    "steps, Adam in one pass. What is left is the rasteriser: 433 000 vectors of 8 pixels forward, as many backward."
+    "EPYC with AVX2, on a scene of its own with fewer pixels. What each part of these kernels gives there: "
+    "docs/decisions/0017. What is left is the rasteriser: 433 000 vectors of 8 pixels forward, as many backward."
 )
 REASONS = {  # why a target is missed, by how its name starts
     "scanline, forward": MILLISECONDS,
@@ -62,7 +61,7 @@ REASONS = {  # why a target is missed, by how its name starts
     "memory, last training step": "Most of it comes before step 500; a leak would grow evenly. "
     "The cause was not found.",
     "peak memory, bands": "Every band keeps its lists, and sums of its own of the gradient of its pose.",
-    "torch twin": "Measured once; a busy machine moves it.",
+    "torch twin": "A busy machine moves it.",
 }
 
 

@@ -13,7 +13,7 @@ INK, GREY, BLUE, ORANGE, GREEN = "#222222", "#8a8a8a", "#2f6db3", "#d9772b", "#2
 COLOURS = {"bands": BLUE, "the paper's way": GREEN, "scanline, 1 thread": GREY}  # of curves; others are scanlines
 STEPS: dict[str, tuple[str, tuple[int, int], str]] = {  # of own time: label, its shift in points, its alignment
     "own-time": ("own time", (-6, 0), "right"),
-    "own-time+shear": ("+ shear, implicit", (-6, 0), "right"),
+    "own-time+shear": ("+ shear", (-6, 0), "right"),
     "scanline": ("scanline", (-6, 0), "right"),
     "scanline-row": ("strips of one row", (7, 2), "left"),
 }
