@@ -203,6 +203,26 @@ def test_the_finding_is_the_mean_gain_over_subjects_that_have_both(store: Store)
     assert findings.finding([], "smoke").gain is None
 
 
+def test_the_recovered_gap_is_a_ratio_of_means_as_in_the_main_table(store: Store) -> None:
+    entries = []
+    for subject, scores in {"a": (20.0, 22.0, 24.0), "b": (30.0, 30.9, 31.0)}.items():
+        for method, psnr in zip(("gauhuman", "rs-avatar", "oracle"), scores, strict=True):
+            submit(store, method=method, subject=subject)
+            job = finish(store, psnr)
+            entries.append(listing.results_of(store, [job])[job])
+    assert findings.finding(entries, "smoke").recovered == pytest.approx(2.9 / 5.0)
+
+
+def test_the_overview_shows_methods_as_they_are_meant(client: httpx.Client, store: Store) -> None:
+    for psnr, changes in ((26.5, {}), (21.5, {"ablation": {"no_rs": True}})):
+        assert post(client, method="rs-avatar", **changes).is_success
+        finish(store, psnr)
+    page = client.get("/").text
+    assert "26.50" in page
+    assert "w/o RS model" not in page
+    assert "w/o RS model" in client.get("/api/v1/tables/main.md").text
+
+
 def with_archives(store: Store, folder: Path) -> str:
     """A succeeded job that kept two pictures."""
     submit(store)
