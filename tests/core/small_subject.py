@@ -23,11 +23,14 @@ def camera(angle: float) -> Camera:
 
 
 def picture(camera: str, frame: int) -> Image:
-    """A bright ellipse that moves from frame to frame."""
+    """A bright ellipse that moves from frame to frame; read-only, as pictures that are shared are."""
     y, x = np.mgrid[:SIZE, :SIZE]
     inside = ((x - 20 - frame) / 8) ** 2 + ((y - 20) / 14) ** 2 < 1
     rgb = np.stack([200 * inside, 90 * inside + 60 * inside * (y % 4 < 2), 120 * inside], -1)
-    return rgb.astype(np.uint8), (255 * inside).astype(np.uint8)
+    pictures = rgb.astype(np.uint8), (255 * inside).astype(np.uint8)
+    for one in pictures:
+        one.setflags(write=False)
+    return pictures
 
 
 def subject() -> Subject:
