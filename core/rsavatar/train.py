@@ -37,6 +37,7 @@ class Observation:
     mask: Tensor  # [h, w] uint8 coverage
     full_size: tuple[int, int]  # height and width of the uncut image
     label: str = ""  # camera and frame, for people
+    weight: float = 1.0  # of its loss: image area by that of the body's box, so that losses are means over the box
 
 
 @dataclass(frozen=True)
@@ -81,11 +82,11 @@ def fit(
         schedule = actor.timed(state.nodes.choose(index, seen.schedule) if settings.skips("nodes") else seen.schedule)
         scene = actor.scene(seen.frame, seen.camera, schedule, skin.weights, settings.degree(state.step))
         image = expose(scene)
-        loss = l1(image, seen.rgb, seen.mask, 0.0, settings.mask_weight)
+        loss = seen.weight * l1(image, seen.rgb, seen.mask, 0.0, settings.mask_weight)
         state.note(index, float(loss.detach()), scene)
         work.add(scene, image, seen.full_size)
         if settings.ssim_weight:
-            loss = loss + settings.ssim_weight * dissimilarity(image, seen.rgb)
+            loss = loss + seen.weight * settings.ssim_weight * dissimilarity(image, seen.rgb)
         if settings.lambda_reg:
             loss = loss + settings.lambda_reg * actor.motion.penalty(settings.continuity)
         torch.autograd.backward(loss)

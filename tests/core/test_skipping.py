@@ -11,7 +11,8 @@ import torch
 from rsavatar import kernels
 from rsavatar.bench.scene import Size, build
 from rsavatar.imaging import NODES, expose, plan, polynomials
-from rsavatar.methods.base import observations, settings
+from rsavatar.losses import l1
+from rsavatar.methods.base import build_actor, observations, settings
 from rsavatar.methods.rolling import RollingShutterAvatar
 from rsavatar.render.base import Scene
 from rsavatar.shutter.base import AbstractShutter
@@ -104,6 +105,15 @@ def test_the_body_skip_cuts_what_its_switch_brings_back() -> None:
     assert all(o.camera.height * o.camera.width <= math.prod(o.full_size) for o in cut)
     assert all((o.camera.height, o.camera.width) == o.full_size for o in whole)
     assert [o.label for o in cut] == [o.label for o in whole]
+    actor = build_actor(method, case)
+    with torch.no_grad():
+        weights = actor.skin_weights()
+        for pair in zip(cut, whole, strict=True):
+            part, all_of_it = (
+                o.weight * l1(expose(actor.scene(o.frame, o.camera, o.schedule, weights, 0)), o.rgb, o.mask, 0.0, 0.1)
+                for o in pair
+            )
+            assert all_of_it == pytest.approx(float(part), rel=0.05), "what lies beyond the box is nearly empty"
 
 
 def test_the_harmonics_wait_unless_they_are_told_not_to() -> None:

@@ -158,10 +158,12 @@ def _observe(method: AbstractMethod, case: Case, name: str, frame: int) -> Obser
     if box is None:
         return None
     x0, y0, x1, y1 = box if "body" in case.spec.skip else (0, 0, camera.width, camera.height)
+    weight = (x1 - x0) * (y1 - y0) / ((box[2] - box[0]) * (box[3] - box[1]))
     pixels = torch.from_numpy(rgb[y0:y1, x0:x1].transpose(2, 0, 1).copy())
     coverage = torch.from_numpy(mask[y0:y1, x0:x1].copy())  # the subject's own may be read-only
     schedule, cut = _schedule(method, case, name, (y0, y1)), camera.cropped(x0, y0, x1, y1)
-    return Observation(frame, cut, schedule, pixels, coverage, (camera.height, camera.width), f"{name}/{frame:06d}")
+    size, label = (camera.height, camera.width), f"{name}/{frame:06d}"
+    return Observation(frame, cut, schedule, pixels, coverage, size, label, weight)
 
 
 def is_sideways(case: Case) -> bool:
