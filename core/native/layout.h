@@ -81,10 +81,23 @@ RS_API int rs_render_backward(RsFrame *frame, const RsGaussians *gaussians, cons
 
 // Mean absolute error of an image over a grey background and of its opacity against a mask, with its gradient.
 //   loss = mean_{3HW} |rgb + background * transmittance - target/255| + mask_weight * mean_{HW} |1 - transmittance - mask/255|
-// target [3, H, W] and mask [H, W] are bytes; target is composited over the background by the mask (target holds
-// premultiplied colour on black). grad_rgb and grad_transmittance are overwritten.
-RS_API double rs_l1(const float *rgb, const float *transmittance, const uint8_t *target, const uint8_t *mask, int height, int width,
-             float background, float mask_weight, int threads, float *grad_rgb, float *grad_transmittance);
+// target is composited over the background by the mask (it holds premultiplied colour on black).
+struct RsTarget {
+    const uint8_t *rgb, *mask;  // [3, H, W], [H, W]
+    float background, mask_weight;
+};
+
+// grad_rgb and grad_transmittance are overwritten.
+RS_API double rs_l1(const float *rgb, const float *transmittance, const RsTarget *target, int height, int width, int threads, float *grad_rgb,
+                    float *grad_transmittance);
+
+// rs_render and rs_l1 in one pass: each strip is compared, and its gradient walked back to the splats, while it is in the cache.
+RS_API int rs_render_l1(RsFrame *frame, const RsGaussians *gaussians, const float *pose, int slots, int coefficients, const RsRows *rows,
+                        const RsCamera *camera, const RsOptions *options, const RsTarget *target, float *rgb, float *transmittance,
+                        RsCounters *counters, double *loss);
+
+// Gradients of `scale` times the loss that `frame` computed last, with the same arguments. Can be called once.
+RS_API int rs_render_l1_backward(RsFrame *frame, const RsGaussians *gaussians, const float *pose, float scale, const RsGradients *gradients);
 
 // Joint angles of B states of one body. Rotations are axis-angle, radians; lengths in metres.
 //   angles, residuals  [B, 24, 3]  a joint turns by exp(angle) exp(residual) relative to its parent; the root's are ignored
@@ -101,6 +114,15 @@ RS_API void rs_pose(const RsBody *body, int states, float *transforms);
 RS_API void rs_pose_backward(const RsBody *body, int states, const float *grad_transforms, float *grad_angles,
                              float *grad_residuals, float *grad_root_rotation, float *grad_root_translation,
                              float *grad_rest_joints);
+
+// Mean gap between the trajectories of consecutive frames (paper, eq. reg), with its gradient.
+//   control [N, P, 25, 3]  axis-angle of the root and of joints 1..23, radians, and a translation, metres
+//   ends [2, P]            weights of the control points at a frame's end, and at its start
+//   meeting [N - 1]        weights of the pairs (n, n + 1)
+//   gap(n) = mean_{j<24} angle between exp(end_n,j) and exp(start_{n+1},j) + |end_n,24 - start_{n+1},24|, the latter where asked for
+// gradient [N, P, 25, 3] is overwritten.
+RS_API double rs_continuity(const float *control, int frames, int points, const double *ends, const double *meeting, int translation,
+                            int threads, float *gradient);
 
 // One step of Adam on `count` parameters; `step` counts from 1 with the step that is to be taken.
 //   value, mean, square, gradient [size]; a null value: the gradient is checked only

@@ -86,12 +86,27 @@ def library() -> Any:
     lib.rs_render_backward.argtypes = [pointer] * 8
     lib.rs_l1.restype = ctypes.c_double
     float_ = ctypes.c_float
-    lib.rs_l1.argtypes = [pointer] * 4 + [integer, integer, float_, float_, integer, pointer, pointer]
+    lib.rs_l1.argtypes = [pointer] * 3 + [integer] * 3 + [pointer] * 2
+    lib.rs_render_l1.argtypes = [pointer, pointer, pointer, integer, integer, *[pointer] * 8]
+    lib.rs_render_l1_backward.argtypes = [pointer, pointer, pointer, float_, pointer]
     lib.rs_pose.argtypes = [pointer, integer, pointer]
     lib.rs_pose_backward.argtypes = [pointer, integer, *[pointer] * 6]
+    lib.rs_continuity.restype = ctypes.c_double
+    lib.rs_continuity.argtypes = [pointer, integer, integer, pointer, pointer, integer, integer, pointer]
     lib.rs_adam.argtypes = [pointer, integer, float_, float_, float_, integer]
     lib.rs_pose.restype = lib.rs_pose_backward.restype = None
     return lib
+
+
+class Target(ctypes.Structure):
+    """What an image is compared with: bytes [3, H, W], a mask [H, W], and how (``RsTarget``)."""
+
+    _fields_ = (
+        ("rgb", ctypes.c_void_p),
+        ("mask", ctypes.c_void_p),
+        ("background", ctypes.c_float),
+        ("mask_weight", ctypes.c_float),
+    )
 
 
 def available() -> bool:

@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 from torch import Tensor
 
+from rsavatar import kernels
 from rsavatar.geometry.rotations import exp_so3
 from rsavatar.motion.base import InitialMotion, unwrap
+from rsavatar.motion.continuity import gap
 from rsavatar.motion.spline import POSITIVE_RANGE, ZERO_MEAN_DEVIATION, FrameSpline, basis_matrix
 from rsavatar.motion.still import StillPose
 
@@ -106,6 +108,24 @@ def test_penalty_gradient(kind: str) -> None:
     assert torch.autograd.gradcheck(lambda _: motion.penalty(kind), (motion.control,))  # type: ignore[arg-type]
 
 
+@pytest.mark.skipif(not kernels.available(), reason="needs the native kernels")
+@pytest.mark.parametrize("translation", [False, True])
+@pytest.mark.parametrize("size", [0.0, 1e-6, 1e-3, 0.5, 3.0, 30.0])
+def test_native_gap_is_the_chains(translation: bool, size: float) -> None:
+    """From equal control points to many turns, with a pair that does not count."""
+    generator = torch.Generator().manual_seed(7)
+    control = size * torch.randn(5, 4, 25, 3, generator=generator)
+    ends = torch.rand(2, 4, generator=generator, dtype=torch.float64)
+    meeting = torch.tensor([0.5, 0.0, 0.25, 0.25], dtype=torch.float64)
+    found = []
+    for points in (control, control.double()):
+        points.requires_grad_()
+        value = gap(points, ends, meeting, translation)
+        (gradient,) = torch.autograd.grad(3 * value, points)
+        found.append((value.detach().double(), gradient.double()))
+    torch.testing.assert_close(found[0], found[1], rtol=2e-6, atol=2e-7)
+
+
 @pytest.mark.parametrize("P", [2, 3, 4, 6])
 def test_aligned_penalty_is_zero_for_continuous_motion_and_the_papers_is_not(P: int) -> None:
     motion = shared_spline(6, P)
@@ -131,8 +151,8 @@ def test_aligned_penalty_adds_the_translations_gap_in_metres() -> None:
 
 def test_frames_whose_windows_do_not_meet_are_not_compared() -> None:
     start = initial(3)
-    gap = InitialMotion(start.poses, start.Rh, start.Th, np.array([5.0, 16.0, 60.0]), PERIOD, PERIOD)
-    near, far = FrameSpline(start, 11), FrameSpline(gap, 11)
+    apart = InitialMotion(start.poses, start.Rh, start.Th, np.array([5.0, 16.0, 60.0]), PERIOD, PERIOD)
+    near, far = FrameSpline(start, 11), FrameSpline(apart, 11)
     far.penalty("aligned").backward()
     assert far.control.grad is not None
     assert float(far.control.grad[2].abs().max()) == 0

@@ -12,13 +12,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rsavatar.geometry.rotations import rotvec_distance
-from rsavatar.motion.base import JOINTS, AbstractMotion, BodyState, Continuity, InitialMotion, split
+from rsavatar.motion.base import AbstractMotion, BodyState, Continuity, InitialMotion, split
+from rsavatar.motion.continuity import gap
 
 Perturbation = Literal["zero-mean", "positive"]
 ZERO_MEAN_DEVIATION = 1e-3  # radians and metres: breaks ties between control points, moves no joint visibly
 POSITIVE_RANGE = (0.001, 0.05)  # radians and metres, MAD-Avatar's public code; biases the pose by about half of it
-_TINY = 1e-20  # keeps the gradient of a length finite at 0
 
 
 def basis_matrix(P: int) -> Tensor:
@@ -58,6 +57,7 @@ class FrameSpline(AbstractMotion):
         self.readout = initial.readout_frames
         self.bands = bands
         self.register_buffer("basis", basis_matrix(P), persistent=False)
+        self._ends: dict[tuple[float, ...], Tensor] = {}
         mids = torch.as_tensor(initial.mid_frames, dtype=torch.float64)
         meeting = ((mids.diff() - self.period).abs() < 1e-6 * self.period).double()
         self.register_buffer("mid_frames", mids, persistent=False)
@@ -84,18 +84,22 @@ class FrameSpline(AbstractMotion):
         translations there, metres, with weight 1. Rh counts as joint 0. Only frames whose windows meet are compared.
         """
         reach = 0.5 if kind == "aligned" else 0.5 * (self.bands - 1) / self.bands * self.readout / self.period
-        ends = self._weights(torch.tensor([0.5 + reach, 0.5 - reach], dtype=torch.float64, device=self.control.device))
-        last, first = torch.einsum("ep,npjc->enjc", ends, self.control)
-        last, first = last[:-1], first[1:]
-        gap = rotvec_distance(last[:, :JOINTS], first[:, :JOINTS]).mean(-1)
-        if kind == "aligned":
-            gap = gap + ((last[:, JOINTS] - first[:, JOINTS]).square().sum(-1) + _TINY).sqrt()
-        return (gap * self.meeting.to(gap.dtype)).sum()
+        return gap(self.control, self._basis_at(0.5 + reach, 0.5 - reach), self.meeting, kind == "aligned")
+
+    def _basis_at(self, *instants: float) -> Tensor:
+        """Weights [E, P] float64 of the control points at ``instants``, u; computed once."""
+        if instants not in self._ends:
+            self._ends[instants] = _powers(torch.tensor(instants, dtype=torch.float64), len(self.basis)) @ self.basis
+        return self._ends[instants]
 
     def _weights(self, u: Tensor) -> Tensor:
         """Weights [..., P] of the control points at ``u`` [...], which may leave [0, 1]."""
-        powers = u[..., None] ** torch.arange(len(self.basis), device=u.device)
-        return (powers.to(self.basis) @ self.basis).to(self.control.dtype)
+        return (_powers(u, len(self.basis)).to(self.basis) @ self.basis).to(self.control.dtype)
+
+
+def _powers(u: Tensor, count: int) -> Tensor:
+    """1, u, ... [..., count]."""
+    return u[..., None] ** torch.arange(count, device=u.device)
 
 
 def _noise(shape: torch.Size, perturbation: Perturbation, seed: int) -> Tensor:
