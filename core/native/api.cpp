@@ -32,19 +32,23 @@ static bool plan(RsFrame &frame, const RsRows *rows, int slots, int count) {
     return count >= 0;
 }
 
-// Rows that no slot covers show the empty background.
-static void clear_uncovered(const RsFrame &frame, float *rgb, float *transmittance) {
-    size_t W = frame.camera.width, HW = frame.camera.height * W;
+// Calls each(lo, hi) for rows that no slot covers.
+template <class Each> static void uncovered(const RsFrame &frame, Each each) {
     int next = 0;
-    auto clear = [&](int lo, int hi) {
-        std::fill(transmittance + lo * W, transmittance + hi * W, 1.f);
-        for (int p = 0; p < 3; p++) std::fill(rgb + p * HW + lo * W, rgb + p * HW + hi * W, 0.f);
-    };
     for (const Group &group : frame.groups) {
         const RsRows &rows = frame.slots[group.first_slot].rows;
-        clear(next, rows.lo), next = rows.hi;
+        each(next, rows.lo), next = rows.hi;
     }
-    clear(next, frame.camera.height);
+    each(next, frame.camera.height);
+}
+
+// They show the empty background.
+static void clear_uncovered(const RsFrame &frame, float *rgb, float *transmittance) {
+    size_t W = frame.camera.width, HW = frame.camera.height * W;
+    uncovered(frame, [&](int lo, int hi) {
+        std::fill(transmittance + lo * W, transmittance + hi * W, 1.f);
+        for (int p = 0; p < 3; p++) std::fill(rgb + p * HW + lo * W, rgb + p * HW + hi * W, 0.f);
+    });
 }
 
 // One slot: threads share its Gaussians. Several: each thread takes whole slots.
@@ -79,31 +83,78 @@ static bool acceptable(const RsGaussians &g, int slots, int coefficients, const 
            options.strip_rows >= 1 && options.threads >= 1;
 }
 
+// All that comes before rasterising; false where an argument is outside its limits.
+static bool prepare(RsFrame &frame, const RsGaussians &g, const float *pose, int slots, int coefficients, const RsRows *rows,
+                    const RsCamera &camera, const RsOptions &options, float *rgb, float *transmittance) {
+    if (!acceptable(g, slots, coefficients, camera, options)) return false;
+    frame.camera = camera, frame.options = options, frame.coefficients = coefficients;
+    if (!plan(frame, rows, slots, g.count)) return false;
+    project_and_bin(frame, g, pose);
+    clear_uncovered(frame, rgb, transmittance);
+    return true;
+}
+
+static RsCounters count(const RsFrame &frame) {
+    RsCounters c = {};
+    for (int t = 0; t < frame.slot_count; t++) {
+        const Slot &slot = frame.slots[t];
+        c.splats += slot.ids.size(), c.pairs += slot.entries.size(), c.broken += slot.broken;
+    }
+    return c;
+}
+
 int rs_render(RsFrame *frame, const RsGaussians *g, const float *pose, int slots, int coefficients, const RsRows *rows,
               const RsCamera *camera, const RsOptions *options, float *rgb, float *transmittance, RsCounters *counters) try {
-    if (!acceptable(*g, slots, coefficients, *camera, *options)) return 2;
-    frame->camera = *camera, frame->options = *options, frame->coefficients = coefficients;
-    if (!plan(*frame, rows, slots, g->count)) return 2;
-    project_and_bin(*frame, *g, pose);
-    clear_uncovered(*frame, rgb, transmittance);
+    if (!prepare(*frame, *g, pose, slots, coefficients, rows, *camera, *options, rgb, transmittance)) return 2;
     raster(*frame, rgb, transmittance);
-    *counters = {};
-    for (int t = 0; t < slots; t++) counters->splats += frame->slots[t].ids.size(), counters->pairs += frame->slots[t].entries.size(), counters->broken += frame->slots[t].broken;
+    *counters = count(*frame);
     return 0;
 } catch (const std::bad_alloc &) {
     return 1;
 }
 
-int rs_render_backward(RsFrame *frame, const RsGaussians *g, const float *pose, const float *rgb, const float *transmittance,
-                       const float *grad_rgb, const float *grad_transmittance, const RsGradients *out) try {
-    size_t M = g->count;
+int rs_render_l1(RsFrame *frame, const RsGaussians *g, const float *pose, int slots, int coefficients, const RsRows *rows,
+                 const RsCamera *camera, const RsOptions *options, const RsTarget *target, float *rgb, float *transmittance,
+                 RsCounters *counters, double *loss) try {
+    if (!prepare(*frame, *g, pose, slots, coefficients, rows, *camera, *options, rgb, transmittance)) return 2;
+    const int H = camera->height, W = camera->width;
+    Comparison comparison(*target, H, W);
+    raster_compared(*frame, comparison, rgb, transmittance);
+    uncovered(*frame, [&](int lo, int hi) {
+        const size_t plane = (size_t)(hi - lo) * W;
+        std::vector<float> gradient(4 * plane);
+        comparison.rows(lo, hi, {rgb, transmittance, (size_t)H * W, W, 0}, {gradient.data(), gradient.data() + 3 * plane, plane, W, lo});
+    });
+    *counters = count(*frame), *loss = comparison.loss();
+    return 0;
+} catch (const std::bad_alloc &) {
+    return 1;
+}
+
+// From the moments to the gradients, which are cleared first.
+static void finish(RsFrame &frame, const RsGaussians &g, const float *pose, float scale, const RsGradients &out) {
+    size_t M = g.count;
     auto zero = [M](float *p, size_t rows) {
         if (p) std::fill(p, p + rows * M, 0.f);
     };
-    zero(out->means, 3), zero(out->rotations, 4), zero(out->log_scales, 3), zero(out->opacity_logits, 1);
-    zero(out->sh, 3 * (size_t)g->bases), zero(out->skin_weights, JOINTS), zero(out->screen, 2);
-    raster_backward(*frame, rgb, transmittance, grad_rgb, grad_transmittance);
-    project_backward(*frame, *g, pose, *out);
+    zero(out.means, 3), zero(out.rotations, 4), zero(out.log_scales, 3), zero(out.opacity_logits, 1);
+    zero(out.sh, 3 * (size_t)g.bases), zero(out.skin_weights, JOINTS), zero(out.screen, 2);
+    project_backward(frame, g, pose, scale, out);
+}
+
+int rs_render_backward(RsFrame *frame, const RsGaussians *g, const float *pose, const float *rgb, const float *transmittance,
+                       const float *grad_rgb, const float *grad_transmittance, const RsGradients *out) try {
+    const int W = frame->camera.width;
+    const size_t plane = (size_t)frame->camera.height * W;
+    raster_backward(*frame, {rgb, transmittance, plane, W, 0}, {grad_rgb, grad_transmittance, plane, W, 0});
+    finish(*frame, *g, pose, 1.f, *out);
+    return 0;
+} catch (const std::bad_alloc &) {
+    return 1;
+}
+
+int rs_render_l1_backward(RsFrame *frame, const RsGaussians *g, const float *pose, float scale, const RsGradients *out) try {
+    finish(*frame, *g, pose, scale, *out);
     return 0;
 } catch (const std::bad_alloc &) {
     return 1;

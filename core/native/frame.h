@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "layout.h"
+#include "loss.h"
 #include "simd.h"
 
 // A projected Gaussian, packed for the rasteriser: one cache line.
@@ -59,6 +60,10 @@ struct Group {  // slots that share their rows
     int first_slot, slots;
 };
 
+struct Task {  // what one thread rasterises at a time
+    int group, strip;
+};
+
 struct RsFrame {
     RsCamera camera;
     RsOptions options;
@@ -66,7 +71,7 @@ struct RsFrame {
     int slot_count = 0;
     std::vector<Slot> slots;           // capacity is kept between images: slots[0, slot_count) are in use
     std::vector<Group> groups;
-    std::vector<std::pair<int, int>> tasks;  // (group, strip)
+    std::vector<Task> tasks;
     std::vector<float> scratch;        // [FIELDS][stride] of the only slot; of several, each thread has its own
     std::vector<float> pose_sums;      // [chunks][T][D * 24 * 12]
 };
@@ -87,9 +92,9 @@ void project(const RsFrame &frame, const RsGaussians &gaussians, const float *po
 void bin(RsFrame &frame, int slot, int count, const Projected &projected);
 void order(const RsFrame &frame, Slot &slot, int strip);
 void raster(RsFrame &frame, float *rgb, float *transmittance);
-void raster_backward(RsFrame &frame, const float *rgb, const float *transmittance, const float *grad_rgb,
-                     const float *grad_transmittance);
-void project_backward(RsFrame &frame, const RsGaussians &gaussians, const float *pose, const RsGradients &gradients);
+void raster_backward(RsFrame &frame, const Planes<const float> &image, const Planes<const float> &gradient);
+void raster_compared(RsFrame &frame, Comparison &comparison, float *rgb, float *transmittance);  // both, through the loss
+void project_backward(RsFrame &frame, const RsGaussians &gaussians, const float *pose, float scale, const RsGradients &gradients);
 
 // Runs work within a parallel region, which no exception may leave: that memory ran out is noted, and thrown after it.
 class Attempt {

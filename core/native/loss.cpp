@@ -1,15 +1,15 @@
 // Mean absolute error with its gradient in one pass over the image.
-#include <algorithm>
-#include <vector>
+#include "loss.h"
 
-#include "layout.h"
+#include <algorithm>
+
 #include "simd.h"
 
-static inline Floats load_bytes(const uint8_t *p, int n) {
-    typedef uint8_t Bytes __attribute__((vector_size(LANES)));
-    Bytes v = {};
-    memcpy(&v, p, n == LANES ? LANES : n);
-    return __builtin_convertvector(v, Floats) * (1.f / 255.f);
+static inline Floats load_some(const uint8_t *p, int n) {
+    if (n == LANES) return load_bytes(p) * (1.f / 255.f);
+    uint8_t padded[LANES] = {};
+    memcpy(padded, p, n);
+    return load_bytes(padded) * (1.f / 255.f);
 }
 
 static inline Floats load_some(const float *p, int n) {
@@ -27,50 +27,59 @@ static inline void store_some(float *p, Floats v, int n) {
 static inline Floats magnitude(Floats x) { return maximum(x, -x); }
 static inline Floats sign(Floats x, float scale) { return keep(x > 0.f, splat(scale)) - keep(x < 0.f, splat(scale)); }
 
-// One row: returns the sums of |colour error| and |coverage error|. Lanes beyond the row hold zeros and add nothing.
-struct RowError {
-    double colour, coverage;
-};
-
+// Where a row lies in the image, the target and the gradient. Passed by value: stores may not change it.
 struct Row {
     const float *rgb, *transmittance;
     const uint8_t *target, *mask;
     float *grad_rgb, *grad_transmittance;
+    size_t plane, target_plane, grad_plane;
+    int width;
 };
 
-static RowError row_error(const Row &row, size_t plane, int width, float background, float colour_scale, float mask_scale) {
+static RowError compare_row(const Row row, float background, float colour_scale, float mask_scale) {
     Floats colour = {}, coverage = {};
-    for (int x = 0; x < width; x += LANES) {
-        const int n = std::min(LANES, width - x);
-        Floats T = load_some(row.transmittance + x, n), opaque = load_bytes(row.mask + x, n), g_t = {};
-        if (n < LANES)
-            for (int i = n; i < LANES; i++) T[i] = 1.f;
+    auto compare = [&](int x, int n) {  // n pixels; lanes beyond them hold zeros and add nothing
+        Floats T = load_some(row.transmittance + x, n), opaque = load_some(row.mask + x, n), g_t = {};
+        for (int i = n; i < LANES; i++) T[i] = 1.f;
         for (int p = 0; p < 3; p++) {
-            Floats d = load_some(row.rgb + p * plane + x, n) - load_bytes(row.target + p * plane + x, n) +
+            Floats d = load_some(row.rgb + p * row.plane + x, n) - load_some(row.target + p * row.target_plane + x, n) +
                        background * (T - 1.f + opaque);
             Floats g = sign(d, colour_scale);
             colour += magnitude(d), g_t += g;
-            store_some(row.grad_rgb + p * plane + x, g, n);
+            store_some(row.grad_rgb + p * row.grad_plane + x, g, n);
         }
         Floats e = 1.f - T - opaque;
         coverage += magnitude(e);
         store_some(row.grad_transmittance + x, background * g_t - sign(e, mask_scale), n);
-    }
+    };
+    int x = 0;
+    for (; x + LANES <= row.width; x += LANES) compare(x, LANES);
+    if (x < row.width) compare(x, row.width - x);
     return {sum(colour), sum(coverage)};
 }
 
-double rs_l1(const float *rgb, const float *transmittance, const uint8_t *target, const uint8_t *mask, int height, int width,
-             float background, float mask_weight, int threads, float *grad_rgb, float *grad_transmittance) {
-    const size_t plane = (size_t)height * width;
-    const float colour_scale = 1.f / (3.f * plane), mask_scale = mask_weight / plane;
-    std::vector<RowError> errors(height);  // added in row order: the same for any number of threads
-#pragma omp parallel for schedule(static) num_threads(threads)
-    for (int y = 0; y < height; y++) {
-        const size_t o = (size_t)y * width;
-        const Row row = {rgb + o, transmittance + o, target + o, mask + o, grad_rgb + o, grad_transmittance + o};
-        errors[y] = row_error(row, plane, width, background, colour_scale, mask_scale);
+void Comparison::rows(int lo, int hi, const Planes<const float> &image, const Planes<float> &gradient) {
+    for (int y = lo; y < hi; y++) {
+        const size_t in = image.row(y), out = gradient.row(y), at = (size_t)y * width;
+        const Row row = {image.rgb + in, image.transmittance + in, target.rgb + at, target.mask + at, gradient.rgb + out,
+                         gradient.transmittance + out, image.plane, pixels, gradient.plane, width};
+        errors[y] = compare_row(row, target.background, 1.f / (3.f * pixels), target.mask_weight / pixels);
     }
+}
+
+double Comparison::loss() const {
     double colour = 0., coverage = 0.;
     for (const RowError &e : errors) colour += e.colour, coverage += e.coverage;
-    return colour / (3. * plane) + mask_weight * coverage / plane;
+    return (colour / 3. + target.mask_weight * coverage) / pixels;
+}
+
+double rs_l1(const float *rgb, const float *transmittance, const RsTarget *target, int height, int width, int threads, float *grad_rgb,
+             float *grad_transmittance) {
+    Comparison comparison(*target, height, width);
+    const size_t plane = (size_t)height * width;
+    const Planes<const float> image{rgb, transmittance, plane, width, 0};
+    const Planes<float> gradient{grad_rgb, grad_transmittance, plane, width, 0};
+#pragma omp parallel for schedule(static) num_threads(threads)
+    for (int y = 0; y < height; y++) comparison.rows(y, y + 1, image, gradient);
+    return comparison.loss();
 }

@@ -98,8 +98,9 @@ struct SplatGradient {
     Floats u, v, A, tilt, S, logit, colour[3];  // log alpha = -(A (dx + tilt dy)^2 + S dy^2) / 2
 };
 
-// Sums the moments of each lane's splat over its strips, in order. False where nothing of the block reached a pixel.
-static bool gather_moments(const Slot &slot, const Block &block, float out[MOMENTS][LANES]) {
+// Sums `scale` times the moments of each lane's splat over its strips, in order. False where nothing of the block reached a
+// pixel.
+static bool gather_moments(const Slot &slot, const Block &block, float scale, float out[MOMENTS][LANES]) {
     constexpr int WIDTH = 16 / LANES;  // vectors in a pair's row of 16
     Ints seen = {};
     for (int lane = 0; lane < LANES; lane++) {
@@ -110,7 +111,7 @@ static bool gather_moments(const Slot &slot, const Block &block, float out[MOMEN
                 for (int i = 0; i < WIDTH; i++) sums[i] += load(&slot.moments[(size_t)pair * 16 + i * LANES]);
         }
         for (int i = 0; i < WIDTH; i++) seen |= sums[i] != 0.f;
-        for (int m = 0; m < MOMENTS; m++) out[m][lane] = sums[m / LANES][m % LANES];
+        for (int m = 0; m < MOMENTS; m++) out[m][lane] = scale * sums[m / LANES][m % LANES];
     }
     return any(seen);
 }
@@ -247,9 +248,9 @@ static void through_blend(const Block &block, const RsGaussians &g, const RsGrad
 }
 
 static void backward_block(const RsFrame &frame, const RsGaussians &g, const RsGradients &out, const float *pose, const Slot &slot,
-                           const Block &block, Floats *sums) {
+                           const Block &block, float scale, Floats *sums) {
     alignas(64) float moments[MOMENTS][LANES];
-    if (!gather_moments(slot, block, moments)) return;
+    if (!gather_moments(slot, block, scale, moments)) return;
     const RsCamera &cam = frame.camera;
     int D = frame.coefficients;
     float rate = slot.rows.rate;
@@ -302,7 +303,7 @@ static void backward_block(const RsFrame &frame, const RsGaussians &g, const RsG
 // every gradient; the pose sums of the chunks are added in order. So the result does not depend on the threads.
 constexpr int CHUNKS = 16;
 
-void project_backward(RsFrame &frame, const RsGaussians &g, const float *pose, const RsGradients &out) {
+void project_backward(RsFrame &frame, const RsGaussians &g, const float *pose, float scale, const RsGradients &out) {
     int D = frame.coefficients, T = frame.slot_count;
     size_t n = (size_t)D * JOINTS * 12;
     frame.pose_sums.assign(out.pose ? CHUNKS * T * n : 0, 0.f);
@@ -319,7 +320,7 @@ void project_backward(RsFrame &frame, const RsGaussians &g, const float *pose, c
             std::fill(sums.begin(), sums.end(), Floats{});
             for (int k = first; k < last;) {
                 const Block block(slot.ids.data(), k, last, end);
-                backward_block(frame, g, out, pose + t * n, slot, block, sums.data());
+                backward_block(frame, g, out, pose + t * n, slot, block, scale, sums.data());
                 k += block.used;
             }
             if (out.pose)

@@ -125,50 +125,37 @@ static void emit(const RsFrame &frame, const Canvas &c, float weight, bool first
     }
 }
 
-void raster(RsFrame &frame, float *rgb, float *transmittance) {
-    int tasks = frame.tasks.size();
-    Attempt attempt;
-#pragma omp parallel num_threads(frame.options.threads)
-    {
-        static thread_local std::vector<float> buffer;
-#pragma omp for schedule(dynamic, 1)
-        for (int task = 0; task < tasks; task++) attempt([&, task] {
-            const Group &group = frame.groups[frame.tasks[task].first];
-            for (int k = 0; k < group.slots; k++) {
-                Slot &slot = frame.slots[group.first_slot + k];
-                const int strip = frame.tasks[task].second;
-                order(frame, slot, strip);
-                Canvas c = open_canvas(frame, slot, strip, FORWARD_PLANES, buffer);
-                blend_strip(frame, slot, strip, c);
-                emit(frame, c, slot.rows.weight, k == 0, rgb, transmittance);
-            }
-        });
+static void draw(RsFrame &frame, Task task, std::vector<float> &buffer, float *rgb, float *transmittance) {
+    const Group &group = frame.groups[task.group];
+    for (int k = 0; k < group.slots; k++) {
+        Slot &slot = frame.slots[group.first_slot + k];
+        order(frame, slot, task.strip);
+        Canvas c = open_canvas(frame, slot, task.strip, FORWARD_PLANES, buffer);
+        blend_strip(frame, slot, task.strip, c);
+        emit(frame, c, slot.rows.weight, k == 0, rgb, transmittance);
     }
-    attempt.settle();
 }
 
 // ---- backward ---------------------------------------------------------------------------------------------------------
 
 // What the gradient walk starts from: T = 1, the upstream gradient, and rest = dL/dC . C + dL/dT T of the whole pixel,
 // from which the contributions are taken one by one, front to back.
-static void open_gradient(const RsFrame &frame, const Slot &slot, const Canvas &c, const Canvas *own, const float *rgb,
-                          const float *transmittance, const float *grad_rgb, const float *grad_transmittance) {
-    int W = frame.camera.width, n = c.x1 - c.x0;
-    size_t HW = (size_t)frame.camera.height * W;
-    float weight = slot.rows.weight;
+static void open_gradient(const Slot &slot, const Canvas &c, const Canvas *own, const Planes<const float> &image,
+                          const Planes<const float> &gradient) {
+    const int n = c.x1 - c.x0;
+    const float weight = slot.rows.weight;
     for (int y = c.r0; y < c.r1; y++) {
         float *t = c.at(y, c.x0), *rest = t + REST_PLANE * c.plane;
-        size_t o = (size_t)y * W + c.x0;
-        std::fill(t, t + c.plane, 1.f), std::fill(rest, rest + (BACKWARD_PLANES - 1) * c.plane, 0.f);
-        for (int p = 0; p < 3; p++)
-            for (int x = 0; x < n; x++) t[(GR_PLANE + p) * c.plane + x] = weight * grad_rgb[p * HW + o + x];
-        for (int x = 0; x < n; x++) {
-            float value = weight * grad_transmittance[o + x] * (own ? std::fabs(own->at(y, c.x0)[x]) : transmittance[o + x]);
-            for (int p = 0; p < 3; p++) {
-                float colour = own ? own->at(y, c.x0)[(R_PLANE + p) * own->plane + x] : rgb[p * HW + o + x];
-                value += t[(GR_PLANE + p) * c.plane + x] * colour;
-            }
-            rest[x] = value;
+        const size_t in = image.row(y) + c.x0, up = gradient.row(y) + c.x0;
+        std::fill(t, t + c.plane, 1.f), std::fill(rest + n, t + 2 * c.plane, 0.f);
+        const float *g = gradient.transmittance + up, *T = own ? own->at(y, c.x0) : image.transmittance + in;
+        for (int x = 0; x < n; x++) rest[x] = weight * g[x] * std::fabs(T[x]);
+        for (int p = 0; p < 3; p++) {
+            float *out = t + (GR_PLANE + p) * c.plane;
+            const float *up_colour = gradient.rgb + p * gradient.plane + up;
+            const float *colour = own ? own->at(y, c.x0) + (R_PLANE + p) * own->plane : image.rgb + p * image.plane + in;
+            for (int x = 0; x < n; x++) out[x] = weight * up_colour[x], rest[x] += out[x] * colour[x];
+            std::fill(out + n, out + c.plane, 0.f);
         }
     }
 }
@@ -206,34 +193,65 @@ template <int N> struct Moments {
     }
 };
 
-void raster_backward(RsFrame &frame, const float *rgb, const float *transmittance, const float *grad_rgb, const float *grad_transmittance) {
-    int tasks = frame.tasks.size();
-    for (int t = 0; t < frame.slot_count; t++) frame.slots[t].moments.resize(frame.slots[t].entries.size() * 16);
-    const Limits limits(frame.options);
-    Attempt attempt;
-#pragma omp parallel num_threads(frame.options.threads)
-    {
-        static thread_local std::vector<float> forward, backward;
-#pragma omp for schedule(dynamic, 1)
-        for (int task = 0; task < tasks; task++) attempt([&, task] {
-            const Group &group = frame.groups[frame.tasks[task].first];
-            int strip = frame.tasks[task].second;
-            for (int k = 0; k < group.slots; k++) {
-                Slot &slot = frame.slots[group.first_slot + k];
-                Canvas own, c = open_canvas(frame, slot, strip, BACKWARD_PLANES, backward);
-                bool averaged = group.slots > 1 || slot.rows.weight != 1.f;
-                if (averaged) {  // the slot's own image is not stored: blend it again
-                    own = open_canvas(frame, slot, strip, FORWARD_PLANES, forward);
-                    blend_strip(frame, slot, strip, own);
-                }
-                open_gradient(frame, slot, c, averaged ? &own : nullptr, rgb, transmittance, grad_rgb, grad_transmittance);
-                auto moments = [&slot](Entry e) { return &slot.moments[(size_t)e.pair * 16]; };
-                for (int e = slot.strip_begin[strip]; e < slot.strip_begin[strip + 1]; e++) std::fill_n(moments(slot.entries[e]), 16, 0.f);
-                each_in_order(slot, strip, {c.r0, c.r1}, [&](Entry e, int lo, int hi) {
-                    walk<Moments>(slot.splats[e.splat], c.part(lo, hi), limits, moments(e));
-                });
-            }
+static void walk_back(RsFrame &frame, Task task, const Limits &limits, std::vector<float> &forward, std::vector<float> &backward,
+                      const Planes<const float> &image, const Planes<const float> &gradient) {
+    const Group &group = frame.groups[task.group];
+    const int strip = task.strip;
+    for (int k = 0; k < group.slots; k++) {
+        Slot &slot = frame.slots[group.first_slot + k];
+        Canvas own, c = open_canvas(frame, slot, strip, BACKWARD_PLANES, backward);
+        bool averaged = group.slots > 1 || slot.rows.weight != 1.f;
+        if (averaged) {  // the slot's own image is not stored: blend it again
+            own = open_canvas(frame, slot, strip, FORWARD_PLANES, forward);
+            blend_strip(frame, slot, strip, own);
+        }
+        open_gradient(slot, c, averaged ? &own : nullptr, image, gradient);
+        auto moments = [&slot](Entry e) { return &slot.moments[(size_t)e.pair * 16]; };
+        for (int e = slot.strip_begin[strip]; e < slot.strip_begin[strip + 1]; e++) std::fill_n(moments(slot.entries[e]), 16, 0.f);
+        each_in_order(slot, strip, {c.r0, c.r1}, [&](Entry e, int lo, int hi) {
+            walk<Moments>(slot.splats[e.splat], c.part(lo, hi), limits, moments(e));
         });
     }
+}
+
+// ---- whole images -----------------------------------------------------------------------------------------------------
+
+template <class Work> static void each_task(const RsFrame &frame, Work work) {
+    const int tasks = frame.tasks.size();
+    Attempt attempt;
+#pragma omp parallel for schedule(dynamic, 1) num_threads(frame.options.threads)
+    for (int task = 0; task < tasks; task++) attempt([&, task] { work(frame.tasks[task]); });
     attempt.settle();
+}
+
+static thread_local std::vector<float> forward_buffer, backward_buffer, gradient_buffer;
+
+static void make_room_for_moments(RsFrame &frame) {
+    for (int t = 0; t < frame.slot_count; t++) frame.slots[t].moments.resize(frame.slots[t].entries.size() * 16);
+}
+
+void raster(RsFrame &frame, float *rgb, float *transmittance) {
+    each_task(frame, [&](Task task) { draw(frame, task, forward_buffer, rgb, transmittance); });
+}
+
+void raster_backward(RsFrame &frame, const Planes<const float> &image, const Planes<const float> &gradient) {
+    make_room_for_moments(frame);
+    const Limits limits(frame.options);
+    each_task(frame, [&](Task task) { walk_back(frame, task, limits, forward_buffer, backward_buffer, image, gradient); });
+}
+
+void raster_compared(RsFrame &frame, Comparison &comparison, float *rgb, float *transmittance) {
+    make_room_for_moments(frame);
+    const Limits limits(frame.options);
+    const int W = frame.camera.width;
+    const Planes<const float> image{rgb, transmittance, (size_t)frame.camera.height * W, W, 0};
+    each_task(frame, [&](Task task) {
+        draw(frame, task, forward_buffer, rgb, transmittance);
+        const Rows rows = rows_of(frame, frame.slots[frame.groups[task.group].first_slot], task.strip);
+        const size_t plane = (size_t)(rows.hi - rows.lo) * W;
+        gradient_buffer.resize(4 * plane);
+        float *g = gradient_buffer.data();
+        comparison.rows(rows.lo, rows.hi, image, {g, g + 3 * plane, plane, W, rows.lo});
+        walk_back(frame, task, limits, forward_buffer, backward_buffer, image, {g, g + 3 * plane, plane, W, rows.lo});
+    });
 }

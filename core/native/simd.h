@@ -29,6 +29,18 @@ static inline Floats load(const float *p) {
     return v;
 }
 
+static inline Floats load_bytes(const uint8_t *p) {
+#if defined(__AVX512F__) && RS_LANES == 16
+    return (Floats)_mm512_cvtepi32_ps(_mm512_cvtepu8_epi32(_mm_loadu_si128((const __m128i *)p)));
+#elif defined(__AVX2__) && RS_LANES == 8
+    return (Floats)_mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_loadl_epi64((const __m128i *)p)));
+#else
+    Floats v;
+    for (int i = 0; i < LANES; i++) v[i] = p[i];
+    return v;
+#endif
+}
+
 static inline void store(float *p, Floats v) { memcpy(p, &v, sizeof v); }
 
 static inline Floats select(Ints mask, Floats a, Floats b) { return mask ? a : b; }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable
 from typing import Any
 
@@ -9,7 +10,8 @@ import torch
 from torch import Tensor
 
 from rsavatar import kernels
-from rsavatar.render.base import Rendering
+from rsavatar.render import native, reference
+from rsavatar.render.base import Rendering, Scene
 
 
 class _NativeL1(torch.autograd.Function):
@@ -17,14 +19,12 @@ class _NativeL1(torch.autograd.Function):
     def forward(ctx: Any, rgb: Tensor, transmittance: Tensor, static: tuple[Tensor, Tensor, float, float]) -> Tensor:
         target, mask, background, mask_weight = static
         ctx.gradients = torch.empty_like(rgb), torch.empty_like(transmittance)
+        compared = kernels.Target(target.data_ptr(), mask.data_ptr(), background, mask_weight)
         value = kernels.library().rs_l1(
             rgb.data_ptr(),
             transmittance.data_ptr(),
-            target.data_ptr(),
-            mask.data_ptr(),
+            ctypes.byref(compared),
             *transmittance.shape,
-            background,
-            mask_weight,
             kernels.threads(),
             *(g.data_ptr() for g in ctx.gradients),
         )
@@ -62,6 +62,16 @@ def l1(image: Rendering, target: Tensor, mask: Tensor, background: float, mask_w
     colour = target.to(image.rgb.dtype) / 255 + background * (1 - coverage)
     error = (image.over(background) - colour).abs().mean()
     return (error + mask_weight * (1 - image.transmittance - coverage).abs().mean()).double()
+
+
+def render_l1(
+    scene: Scene, target: Tensor, mask: Tensor, background: float, mask_weight: float
+) -> tuple[Rendering, Tensor]:
+    """The image of ``scene`` and its ``l1``: one pass over the picture, of which only the loss is differentiable."""
+    if kernels.available():
+        return native.render_l1(scene, target, mask, background, mask_weight)
+    image = reference.render(scene)
+    return image, l1(image, target, mask, background, mask_weight)
 
 
 WINDOW, DEVIATION = 11, 1.5  # pixels: GauHuman's, and Wang et al.'s

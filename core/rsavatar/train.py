@@ -17,10 +17,10 @@ from rsavatar.errors import DivergedError, Interrupted, expected
 from rsavatar.events import Note, Progress, Report
 from rsavatar.geometry.cameras import Camera
 from rsavatar.imaging import Actor, Schedule, expose
-from rsavatar.losses import dissimilarity, l1
+from rsavatar.losses import dissimilarity, l1, render_l1
 from rsavatar.optimization import BLOCK, Saver, Settings, SkinBlock, State
 from rsavatar.painting import paint
-from rsavatar.render.base import Rendering
+from rsavatar.render.base import Rendering, Scene
 from rsavatar.skipping import Work
 
 REPORT_EVERY = 25  # steps
@@ -81,12 +81,10 @@ def fit(
 
         schedule = actor.timed(state.nodes.choose(index, seen.schedule) if settings.skips("nodes") else seen.schedule)
         scene = actor.scene(seen.frame, seen.camera, schedule, skin.weights, settings.degree(state.step))
-        image = expose(scene)
-        loss = seen.weight * l1(image, seen.rgb, seen.mask, 0.0, settings.mask_weight)
+        image, error = _compare(scene, seen, settings)
+        loss = seen.weight * error
         state.note(index, float(loss.detach()), scene)
         work.add(scene, image, seen.full_size)
-        if settings.ssim_weight:
-            loss = loss + seen.weight * settings.ssim_weight * dissimilarity(image, seen.rgb)
         if settings.lambda_reg:
             loss = loss + settings.lambda_reg * actor.motion.penalty(settings.continuity)
         torch.autograd.backward(loss)
@@ -116,6 +114,15 @@ def fit(
             skin = SkinBlock(actor)
     doubted = tuple(seen.label for seen, bad in zip(observations, state.doubt.doubted.tolist(), strict=True) if bad)
     return Trained(state.seconds, state.rejected, saver.path, doubted)
+
+
+def _compare(scene: Scene, seen: Observation, settings: Settings) -> tuple[Rendering, Tensor]:
+    """The image of a scene, and how far it is from what was seen. Without SSIM, both are found in one pass."""
+    if not settings.ssim_weight:
+        return render_l1(scene, seen.rgb, seen.mask, 0.0, settings.mask_weight)
+    image = expose(scene)
+    error = l1(image, seen.rgb, seen.mask, 0.0, settings.mask_weight)
+    return image, error + settings.ssim_weight * dissimilarity(image, seen.rgb)
 
 
 def _begin(actor: Actor, observations: Sequence[Observation], settings: Settings, saver: Saver) -> State:

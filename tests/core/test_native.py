@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from typing import Any
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from rsavatar import kernels
 from rsavatar.errors import KernelError
+from rsavatar.losses import l1
 from rsavatar.render import native, reference
 from rsavatar.render.base import Gaussians, Options, Rendering, Scene, TimedRows
 from tests.core import scenes
@@ -48,6 +50,56 @@ def test_image_and_gradients_of_every_input_equal_the_twin(kind: str, bases: int
     for name, want in expected.items():
         error = (got[name] - want).norm() / want.norm()
         assert error < 1e-4, f"gradient of {name}: relative error {error:.1e}"
+
+
+def losses(render_l1: object, kind: str) -> tuple[Rendering, float, dict[str, Tensor]]:
+    """Three times the loss of a scene against noise, over grey, with its gradients."""
+    s, tensors = leaves(scenes.scene(kind, count=400, dtype=torch.float32))
+    noise = torch.Generator().manual_seed(1)
+    target = torch.randint(0, 256, (4, scenes.HEIGHT, scenes.WIDTH), generator=noise, dtype=torch.uint8)
+    image, loss = render_l1(s, target[:3], target[3], 0.3, 0.1)  # type: ignore[operator]
+    (3 * loss).backward()
+    return image, float(loss.detach()), {name: x.grad for name, x in tensors.items() if x.grad is not None}
+
+
+def in_two_passes(s: Scene, *compared: Any) -> tuple[Rendering, Tensor]:
+    image = native.render(s)
+    return image, l1(image, *compared)
+
+
+@pytest.mark.parametrize("kind", scenes.KINDS)
+def test_one_pass_through_the_loss_equals_two(kind: str) -> None:
+    image, loss, expected = losses(in_two_passes, kind)
+    fused, same, got = losses(native.render_l1, kind)
+    assert torch.equal(fused.rgb, image.rgb)
+    assert torch.equal(fused.transmittance, image.transmittance)
+    assert not fused.rgb.requires_grad
+    assert (fused.splats, fused.pairs, fused.broken) == (image.splats, image.pairs, image.broken)
+    assert same == loss
+    assert set(got) == set(expected)
+    for name, want in expected.items():
+        torch.testing.assert_close(got[name], want, rtol=1e-4, atol=1e-6 * float(want.abs().max()))
+
+
+@pytest.mark.parametrize("kind", scenes.KINDS)
+def test_one_pass_gives_the_same_bits_with_any_number_of_threads(kind: str) -> None:
+    before, runs = kernels.threads(), []
+    try:
+        for threads in (1, 2, 3):
+            kernels.use_threads(threads)
+            runs.append(losses(native.render_l1, kind))
+    finally:
+        kernels.use_threads(before)
+    for _, loss, grads in runs[1:]:
+        assert loss == runs[0][1]
+        assert all(torch.equal(grads[name], runs[0][2][name]) for name in grads)
+
+
+def test_a_target_of_another_size_is_refused() -> None:
+    s = scenes.scene("global", dtype=torch.float32)
+    target = torch.zeros(3, scenes.HEIGHT, scenes.WIDTH - 1, dtype=torch.uint8)
+    with pytest.raises(KernelError, match="target: expected"):
+        native.render_l1(s, target, target[0], 0.0, 0.0)
 
 
 @pytest.mark.parametrize("kind", scenes.KINDS)

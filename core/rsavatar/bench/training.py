@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import gc
 from functools import cache
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import Tensor
 
 from rsavatar.avatar.avatar import Avatar
 from rsavatar.avatar.networks import PoseResidual, SkinOffset
@@ -16,7 +17,7 @@ from rsavatar.bench.scene import PARENTS, READOUT, REST_JOINTS, MovingBody, Size
 from rsavatar.bench.ways import Way, compose_whole, scan
 from rsavatar.body.base import SHAPES, BodyModel
 from rsavatar.imaging import Actor, expose, plan
-from rsavatar.losses import l1
+from rsavatar.losses import l1, render_l1
 from rsavatar.methods.base import body_box
 from rsavatar.motion.base import JOINTS, InitialMotion
 from rsavatar.motion.spline import FrameSpline
@@ -41,7 +42,7 @@ class Training:
         body = build(size)
         self._seen = _observe(body, way)
         self._actor = _actor(body, size, frames)
-        self._render: Callable[[Scene], Rendering] = compose_whole if way.whole else expose
+        self._compare = _whole_l1 if way.whole else render_l1
         self._settings = Settings(
             iterations=20_000,
             seed=0,
@@ -56,6 +57,7 @@ class Training:
         )
         self._state = State(self._actor, self._settings)
         self._skin = SkinBlock(self._actor)
+        gc.freeze()  # as ``train.fit`` does
 
     def step(self) -> None:
         """One step of ``train.fit``'s loop."""
@@ -63,7 +65,7 @@ class Training:
         state.set_rates(settings)
         degree = settings.degree(state.step)
         scene = actor.scene(seen.frame, seen.camera, seen.schedule, self._skin.weights, degree)
-        loss = l1(self._render(scene), seen.rgb, seen.mask, 0.0, settings.mask_weight)
+        _, loss = self._compare(scene, seen.rgb, seen.mask, 0.0, settings.mask_weight)
         loss = loss + settings.lambda_reg * actor.motion.penalty(settings.continuity)
         torch.autograd.backward(loss)
         state.advance(actor, scene.gaussians.screen, loss.detach(), seen.full_size)
@@ -77,6 +79,13 @@ class Training:
     def amortised(step_ms: float, refresh_ms: float) -> float:
         """Milliseconds of a step with its share of a refresh."""
         return step_ms + refresh_ms / BLOCK
+
+
+def _whole_l1(
+    scene: Scene, target: Tensor, mask: Tensor, background: float, mask_weight: float
+) -> tuple[Rendering, Tensor]:
+    image = compose_whole(scene)
+    return image, l1(image, target, mask, background, mask_weight)
 
 
 def _observe(body: MovingBody, way: Way) -> Observation:

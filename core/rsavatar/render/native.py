@@ -6,7 +6,9 @@ Layouts are those of ``core/native/layout.h``; tensors cross without a copy. The
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -14,7 +16,7 @@ from torch import Tensor
 
 from rsavatar.errors import KernelError, expected
 from rsavatar.geometry.cameras import Camera
-from rsavatar.kernels import library, threads
+from rsavatar.kernels import Target, library, threads
 from rsavatar.render.base import Gaussians, Options, Rendering, Scene, TimedRows
 
 _FIELDS = ("means", "rotations", "log_scales", "opacity_logits", "sh", "skin_weights", "screen")
@@ -62,6 +64,19 @@ class _Counters(ctypes.Structure):
     _fields_ = tuple((name, ctypes.c_int64) for name in ("splats", "pairs", "broken"))
 
 
+_Tensors = tuple[Tensor, ...]  # the seven of ``Gaussians``, and the pose
+
+
+@dataclass(frozen=True)
+class _Static:
+    """What an image takes besides tensors."""
+
+    rows: tuple[TimedRows, ...]
+    camera: Camera
+    options: Options
+    target: Target | None = None
+
+
 _FLAGS = {"shear": 1, "implicit": 2, "resort": 4}
 _REASONS = {1: "out of memory", 2: "an argument is outside the limits of core/native/layout.h"}
 
@@ -95,7 +110,7 @@ def _c_options(o: Options) -> _Options:
     return _Options(*limits, o.strip_rows, threads(), sum(_FLAGS[name] for name in o.without))
 
 
-def _c_gaussians(tensors: tuple[Tensor, ...]) -> _Gaussians:
+def _c_gaussians(tensors: _Tensors) -> _Gaussians:
     return _Gaussians(tensors[0].shape[1], tensors[4].shape[0], *(t.data_ptr() for t in tensors[:7]))
 
 
@@ -105,59 +120,57 @@ def _check(code: int) -> None:
 
 
 class _Render(torch.autograd.Function):
-    """rgb, transmittance = f(the seven tensors of ``Gaussians``, pose); see ``rs_render`` in layout.h."""
+    """rgb, transmittance, loss = f(the seven tensors of ``Gaussians``, pose); see ``rs_render`` in layout.h.
+
+    With a target only the loss is differentiable, and its gradient is on its way already; without one, only the image.
+    """
 
     @staticmethod
-    def forward(ctx: Any, static: tuple[Any, ...], *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        rows, camera, options = static
-        frame = _Frame()
+    def forward(ctx: Any, static: _Static, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        frame, camera = _Frame(), static.camera
         tensors = tuple(t.detach().contiguous() for t in tensors)
-        pose = tensors[7]
-        rgb = torch.empty(3, camera.height, camera.width)
-        transmittance = torch.empty(camera.height, camera.width)
-        counters = _Counters()
-        code = library().rs_render(
-            frame.handle,
-            ctypes.byref(_c_gaussians(tensors)),
-            pose.data_ptr(),
-            pose.shape[0],
-            pose.shape[1],
-            ctypes.byref((_Rows * len(rows))(*(_Rows(r.lo, r.hi, r.rate, r.start, r.weight) for r in rows))),
-            ctypes.byref(_c_camera(camera)),
-            ctypes.byref(_c_options(options)),
-            rgb.data_ptr(),
-            transmittance.data_ptr(),
-            ctypes.byref(counters),
-        )
+        pose, counters, loss = tensors[7], _Counters(), ctypes.c_double(math.nan)
+        rgb, transmittance = torch.empty(3, camera.height, camera.width), torch.empty(camera.height, camera.width)
+        rows = (_Rows * len(static.rows))(*(_Rows(r.lo, r.hi, r.rate, r.start, r.weight) for r in static.rows))
+        what = (frame.handle, ctypes.byref(_c_gaussians(tensors)), pose.data_ptr(), *pose.shape[:2], ctypes.byref(rows))
+        how = (ctypes.byref(_c_camera(camera)), ctypes.byref(_c_options(static.options)))
+        found = (rgb.data_ptr(), transmittance.data_ptr(), ctypes.byref(counters))
+        if static.target is None:
+            code = library().rs_render(*what, *how, *found)
+        else:
+            code = library().rs_render_l1(*what, *how, ctypes.byref(static.target), *found, ctypes.byref(loss))
         _check(code)
         ctx.frame = frame if any(ctx.needs_input_grad) else None
+        ctx.compared = static.target is not None
         ctx.save_for_backward(*tensors, rgb, transmittance)
+        ctx.set_materialize_grads(False)
         counted = torch.tensor([counters.splats, counters.pairs, counters.broken])
-        ctx.mark_non_differentiable(counted)
-        return rgb, transmittance, counted
+        value = torch.tensor(loss.value, dtype=torch.float64)
+        ctx.mark_non_differentiable(counted, *((rgb, transmittance) if ctx.compared else (value,)))
+        return rgb, transmittance, value, counted
 
     @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
         *tensors, rgb, transmittance = ctx.saved_tensors
         if ctx.frame is None:
             raise KernelError(expected("native render", "one backward for one forward", "a second backward"))
         needs = ctx.needs_input_grad[1:]
         wanted = [torch.empty_like(t) if need else None for t, need in zip(tensors, needs, strict=True)]
-        grad_rgb, grad_transmittance = upstream[0].contiguous(), upstream[1].contiguous()
-        gradients = _Gradients(*(None if t is None else t.data_ptr() for t in wanted))
-        code = library().rs_render_backward(
-            ctx.frame.handle,
-            ctypes.byref(_c_gaussians(tuple(tensors))),
-            tensors[7].data_ptr(),
-            rgb.data_ptr(),
-            transmittance.data_ptr(),
-            grad_rgb.data_ptr(),
-            grad_transmittance.data_ptr(),
-            ctypes.byref(gradients),
-        )
+        gradients = ctypes.byref(_Gradients(*(None if t is None else t.data_ptr() for t in wanted)))
+        what = (ctx.frame.handle, ctypes.byref(_c_gaussians(tuple(tensors))), tensors[7].data_ptr())
+        if ctx.compared:
+            code = library().rs_render_l1_backward(*what, _scalar(upstream[2]), gradients)
+        else:
+            image = (rgb, transmittance)
+            sent = [torch.zeros_like(t) if g is None else g.contiguous() for g, t in zip(upstream, image, strict=False)]
+            code = library().rs_render_backward(*what, *(t.data_ptr() for t in (*image, *sent)), gradients)
         ctx.frame = None  # back to the pool
         _check(code)
         return (None, *wanted)
+
+
+def _scalar(upstream: Tensor | None) -> float:
+    return 0.0 if upstream is None else float(upstream)
 
 
 def render(scene: Scene) -> Rendering:
@@ -169,14 +182,37 @@ def render(scene: Scene) -> Rendering:
         KernelError: if a tensor is not float32 on the CPU or of a wrong shape, if slots' rows partly overlap or leave
             the image, or if no kernel library fits this machine.
     """
-    g = scene.gaussians
-    tensors = (*(getattr(g, name) for name in _FIELDS), scene.pose)
-    _validate(g, scene.pose, scene.rows)
-    rgb, transmittance, counted = _apply((scene.rows, scene.camera, scene.options), *tensors)
+    rgb, transmittance, _, counted = _apply(_Static(scene.rows, scene.camera, scene.options), *_inputs(scene))
     return Rendering(rgb, transmittance, *counted.tolist())
 
 
-_apply: Callable[..., tuple[Tensor, Tensor, Tensor]] = _Render.apply  # torch leaves apply untyped
+def render_l1(
+    scene: Scene, target: Tensor, mask: Tensor, background: float, mask_weight: float
+) -> tuple[Rendering, Tensor]:
+    """``render(scene)`` and its ``losses.l1`` in one pass: a strip is compared, and walked back, while it is at hand.
+
+    Only the loss is differentiable, the image is not.
+
+    Raises:
+        KernelError: as ``render``; or if target or mask are not bytes [3, H, W] and [H, W].
+    """
+    size = scene.camera.height, scene.camera.width
+    for name, tensor, shape in (("target", target, (3, *size)), ("mask", mask, size)):
+        if tensor.dtype != torch.uint8 or tuple(tensor.shape) != shape:
+            raise KernelError(expected(name, f"torch.uint8 {shape}", f"{tensor.dtype} {tuple(tensor.shape)}"))
+    target, mask = target.contiguous(), mask.contiguous()
+    compared = Target(target.data_ptr(), mask.data_ptr(), background, mask_weight)
+    static = _Static(scene.rows, scene.camera, scene.options, compared)
+    rgb, transmittance, loss, counted = _apply(static, *_inputs(scene))
+    return Rendering(rgb, transmittance, *counted.tolist()), loss
+
+
+_apply: Callable[..., tuple[Tensor, Tensor, Tensor, Tensor]] = _Render.apply  # torch leaves apply untyped
+
+
+def _inputs(scene: Scene) -> _Tensors:
+    _validate(scene.gaussians, scene.pose, scene.rows)
+    return (*(getattr(scene.gaussians, name) for name in _FIELDS), scene.pose)
 
 
 def _validate(g: Gaussians, pose: Tensor, rows: tuple[TimedRows, ...]) -> None:
