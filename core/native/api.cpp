@@ -55,23 +55,20 @@ static void clear_uncovered(const RsFrame &frame, float *rgb, float *transmittan
 static void project_and_bin(RsFrame &frame, const RsGaussians &g, const float *pose) {
     constexpr int CHUNK = 64 * LANES;
     int M = g.count, T = frame.slot_count, threads = frame.options.threads;
-    const size_t stride = padded(M);
     if (T == 1) {
-        frame.scratch.resize(FIELDS * stride);
-        const Projected out{frame.scratch.data(), stride};
+        frame.projected.resize(M);
 #pragma omp parallel for schedule(dynamic, 1) num_threads(threads)
-        for (int begin = 0; begin < M; begin += CHUNK) project(frame, g, pose, 0, begin, std::min(begin + CHUNK, M), out);
-        return bin(frame, 0, M, out);
+        for (int begin = 0; begin < M; begin += CHUNK) project(frame, g, pose, 0, begin, std::min(begin + CHUNK, M), frame.projected.data());
+        return bin(frame, 0, frame.projected);
     }
     Attempt attempt;
 #pragma omp parallel num_threads(threads)
     {
-        static thread_local std::vector<float> scratch;
+        static thread_local std::vector<Splat> projected;
 #pragma omp for schedule(dynamic, 1)
         for (int t = 0; t < T; t++) attempt([&, t] {
-            scratch.resize(FIELDS * stride);
-            const Projected out{scratch.data(), stride};
-            project(frame, g, pose, t, 0, M, out), bin(frame, t, M, out);
+            projected.resize(M);
+            project(frame, g, pose, t, 0, M, projected.data()), bin(frame, t, projected);
         });
     }
     attempt.settle();

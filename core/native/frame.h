@@ -16,7 +16,7 @@ struct alignas(64) Splat {
     float r, g, b;
     int16_t x_lo, x_hi, y_lo, y_hi;    // where alpha >= alpha_min can hold, clipped to the slot and the image
     float depth, depth_rate, tau;      // depth at its own tau, and its derivative in tau
-    int32_t survivor;                  // index into Slot::ids
+    int32_t fate;
 };
 static_assert(sizeof(Splat) == 64, "one cache line");
 
@@ -34,25 +34,22 @@ struct Rows {
 // coordinates x = dx + tilt dy and y = dy.
 enum Moment { M0, MX, MY, MXX, MXY, MYY, MR, MG, MB, MOMENTS };
 
-// What is projected of a Gaussian, before culling.
-enum Field { U, V, QXX, TILT, QYY, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH, DEPTH_RATE, TAU, HALF_X, HALF_Y, FIELDS };
-
-constexpr float BEHIND = -1.f, BROKEN = -2.f;  // in place of a depth
+enum Fate { SURVIVES = 0, UNSEEN = -1, BROKEN = -2 };  // broken: a number of the Gaussian's, or of its pose's, is not finite
 
 struct Slot {
     RsRows rows;
     int strips;
-    int broken;                        // Gaussians left out because a number of theirs is not finite
+    int broken;                        // Gaussians whose fate that was
     std::vector<int32_t> ids;          // surviving Gaussians, ascending
     std::vector<float> tau;            // of the survivors
-    std::vector<int32_t> rank;         // survivor -> its splat
-    std::vector<Splat> splats;         // by depth
+    std::vector<Splat> splats;         // theirs
     std::vector<int32_t> first_pair;   // splat -> its first pair; a splat's pairs are its strips, from the top; [n + 1]
+    std::vector<int32_t> first_strip;  // of a splat
     std::vector<int32_t> strip_begin;  // strip -> its first entry; [strips + 1]
     std::vector<int16_t> strip_x_lo, strip_x_hi;  // columns that the strip's splats reach
     std::vector<Entry> entries;        // the strips' lists, by depth
     std::vector<float> moments;        // [pairs][16], written by the backward raster
-    std::vector<uint32_t> keys, keys2;
+    std::vector<uint32_t> keys, keys2;     // depths of the splats in `order`
     std::vector<int32_t> order, order2;
 };
 
@@ -72,7 +69,7 @@ struct RsFrame {
     std::vector<Slot> slots;           // capacity is kept between images: slots[0, slot_count) are in use
     std::vector<Group> groups;
     std::vector<Task> tasks;
-    std::vector<float> scratch;        // [FIELDS][stride] of the only slot; of several, each thread has its own
+    std::vector<Splat> projected;      // every Gaussian in the only slot; of several slots, each thread has its own
     std::vector<float> pose_sums;      // [chunks][T][D * 24 * 12]
 };
 
@@ -81,15 +78,8 @@ static inline Rows rows_of(const RsFrame &frame, const Slot &slot, int strip) {
     return {lo, lo + frame.options.strip_rows < slot.rows.hi ? lo + frame.options.strip_rows : slot.rows.hi};
 }
 
-// A slot's projected Gaussians before culling, structure of arrays.
-struct Projected {
-    float *base;
-    size_t stride;
-    float operator()(Field f, int i) const { return base[f * stride + i]; }
-};
-
-void project(const RsFrame &frame, const RsGaussians &gaussians, const float *pose, int slot, int begin, int end, const Projected &out);
-void bin(RsFrame &frame, int slot, int count, const Projected &projected);
+void project(const RsFrame &frame, const RsGaussians &gaussians, const float *pose, int slot, int begin, int end, Splat *projected);
+void bin(RsFrame &frame, int slot, const std::vector<Splat> &projected);
 void order(const RsFrame &frame, Slot &slot, int strip);
 void raster(RsFrame &frame, float *rgb, float *transmittance);
 void raster_backward(RsFrame &frame, const Planes<const float> &image, const Planes<const float> &gradient);
@@ -112,6 +102,3 @@ public:
         if (failed) throw std::bad_alloc();
     }
 };
-
-// Stride of the scratch arrays: whole vectors, plus one so that a block may start anywhere.
-static inline size_t padded(int count) { return ((size_t)count + 2 * LANES - 1) / LANES * LANES; }

@@ -48,7 +48,10 @@ static Ints finite(const Block &block, const RsGaussians &g, const Posed &p, con
     return ((Ints)all & 0x7f800000) != 0x7f800000;
 }
 
-static void project_block(const RsFrame &frame, const RsGaussians &g, const float *pose, int first, const Slot &slot, const Projected &projected) {
+// Index of the first pixel whose centre is not before `edge`, within [lo, hi].
+static Floats first_centre(Floats edge, float lo, float hi) { return round_up(clamp(edge - 0.5f, lo, hi)); }
+
+static void project_block(const RsFrame &frame, const RsGaussians &g, const float *pose, int first, const Slot &slot, Splat *projected) {
     const RsCamera &cam = frame.camera;
     const RsOptions &o = frame.options;
     int D = frame.coefficients;
@@ -73,22 +76,29 @@ static void project_block(const RsFrame &frame, const RsGaussians &g, const floa
     Floats half_x = square_root(reach * maximum(f.sxx + 2.f * shear * f.sxy + shear * shear * f.syy, Floats{}));
     Floats half_y = square_root(reach * f.syy) / maximum(slack, -slack);
 
-    Floats out[FIELDS];
-    out[U] = p.u + block.get(g.screen), out[V] = p.v + block.get(g.screen + g.count);
-    out[QXX] = f.A * (-0.5f * LOG2_E), out[TILT] = -(slack * f.r + a);
-    out[QYY] = slack * slack * f.inverse_syy * (-0.5f * LOG2_E);
-    out[LOG2_OPACITY] = log2_opacity;
-    for (int k = 0; k < 3; k++) out[RED + k] = maximum(s.colour[k], Floats{});
-    out[DEPTH] = select(finite(block, g, p, f, s), select(p.in_front, p.camera.z, splat(BEHIND)), splat(BROKEN));
-    out[DEPTH_RATE] = p.velocity.z, out[TAU] = tau;
-    out[HALF_X] = half_x, out[HALF_Y] = half_y;
-    for (int k = 0; k < FIELDS; k++) store(projected.base + k * projected.stride + first, out[k]);
+    const Floats u = p.u + block.get(g.screen), v = p.v + block.get(g.screen + g.count);
+    const Floats qxx = f.A * (-0.5f * LOG2_E), tilt = -(slack * f.r + a), qyy = slack * slack * f.inverse_syy * (-0.5f * LOG2_E);
+    // Who can reach a pixel of the slot. Comparisons are written so that NaN is dropped.
+    const float top = slot.rows.lo, bottom = slot.rows.hi, width = cam.width;
+    const Ints seen = p.in_front & (log2_opacity > log2(splat(o.alpha_min))) & (qxx <= 0.f) & (v + half_y > top) & (v - half_y < bottom) &
+                      (u + half_x > 0.f) & (u - half_x < width);
+    const Ints sound = finite(block, g, p, f, s);
+    const Floats x_lo = first_centre(u - half_x, 0.f, width), x_hi = first_centre(u + half_x, 0.f, width);
+    const Floats y_lo = first_centre(v - half_y, top, bottom), y_hi = first_centre(v + half_y, top, bottom);
+    for (int i = 0; i < LANES && first + i < g.count; i++) {
+        Splat &out = projected[first + i];
+        out.u = u[i], out.v = v[i], out.qxx = qxx[i], out.tilt = tilt[i], out.qyy = qyy[i], out.log2_opacity = log2_opacity[i];
+        out.r = std::max(s.colour[0][i], 0.f), out.g = std::max(s.colour[1][i], 0.f), out.b = std::max(s.colour[2][i], 0.f);
+        out.x_lo = x_lo[i], out.x_hi = x_hi[i], out.y_lo = y_lo[i], out.y_hi = y_hi[i];
+        out.depth = p.camera.z[i], out.depth_rate = p.velocity.z[i], out.tau = tau[i];
+        out.fate = !sound[i] ? BROKEN : seen[i] ? SURVIVES : UNSEEN;
+    }
 }
 
-void project(const RsFrame &frame, const RsGaussians &g, const float *pose, int index, int begin, int end, const Projected &out) {
+void project(const RsFrame &frame, const RsGaussians &g, const float *pose, int index, int begin, int end, Splat *projected) {
     const Slot &slot = frame.slots[index];
     const float *slot_pose = pose + (size_t)index * frame.coefficients * JOINTS * 12;
-    for (int first = begin; first < end; first += LANES) project_block(frame, g, slot_pose, first, slot, out);
+    for (int first = begin; first < end; first += LANES) project_block(frame, g, slot_pose, first, slot, projected);
 }
 
 // ---- backward ---------------------------------------------------------------------------------------------------------
@@ -106,7 +116,7 @@ static bool gather_moments(const Slot &slot, const Block &block, float scale, fl
     for (int lane = 0; lane < LANES; lane++) {
         Floats sums[WIDTH] = {};
         if (block.live[lane]) {
-            const int k = slot.rank[block.survivors[lane]];
+            const int k = block.survivors[lane];
             for (int pair = slot.first_pair[k]; pair < slot.first_pair[k + 1]; pair++)
                 for (int i = 0; i < WIDTH; i++) sums[i] += load(&slot.moments[(size_t)pair * 16 + i * LANES]);
         }

@@ -87,6 +87,11 @@ static inline Floats square_root(Floats a) {
 #endif
 }
 
+static inline Floats round_up(Floats a) {  // |a| < 2^31
+    const Floats whole = __builtin_convertvector(__builtin_convertvector(a, Ints), Floats);
+    return whole + keep(whole < a, splat(1.f));
+}
+
 // Sum of the lanes in a fixed order (halves, quarters, ...): repeatable, and short for the compiler.
 static inline float sum(Floats v) {
     float a[LANES];
