@@ -82,12 +82,11 @@ static bool acceptable(const RsGaussians &g, int slots, int coefficients, const 
 
 // All that comes before rasterising; false where an argument is outside its limits.
 static bool prepare(RsFrame &frame, const RsGaussians &g, const float *pose, int slots, int coefficients, const RsRows *rows,
-                    const RsCamera &camera, const RsOptions &options, float *rgb, float *transmittance) {
+                    const RsCamera &camera, const RsOptions &options) {
     if (!acceptable(g, slots, coefficients, camera, options)) return false;
     frame.camera = camera, frame.options = options, frame.coefficients = coefficients;
     if (!plan(frame, rows, slots, g.count)) return false;
     project_and_bin(frame, g, pose);
-    clear_uncovered(frame, rgb, transmittance);
     return true;
 }
 
@@ -100,10 +99,15 @@ static RsCounters count(const RsFrame &frame) {
     return c;
 }
 
+template <class Value> static Planes<Value> whole(const RsCamera &camera, Value *rgb, Value *transmittance) {
+    return {rgb, transmittance, (size_t)camera.height * camera.width, 0, camera.width, 0};
+}
+
 int rs_render(RsFrame *frame, const RsGaussians *g, const float *pose, int slots, int coefficients, const RsRows *rows,
               const RsCamera *camera, const RsOptions *options, float *rgb, float *transmittance, RsCounters *counters) try {
-    if (!prepare(*frame, *g, pose, slots, coefficients, rows, *camera, *options, rgb, transmittance)) return 2;
-    raster(*frame, rgb, transmittance);
+    if (!prepare(*frame, *g, pose, slots, coefficients, rows, *camera, *options)) return 2;
+    clear_uncovered(*frame, rgb, transmittance);
+    raster(*frame, whole(*camera, rgb, transmittance));
     *counters = count(*frame);
     return 0;
 } catch (const std::bad_alloc &) {
@@ -111,18 +115,13 @@ int rs_render(RsFrame *frame, const RsGaussians *g, const float *pose, int slots
 }
 
 int rs_render_l1(RsFrame *frame, const RsGaussians *g, const float *pose, int slots, int coefficients, const RsRows *rows,
-                 const RsCamera *camera, const RsOptions *options, const RsTarget *target, float *rgb, float *transmittance,
-                 RsCounters *counters, double *loss) try {
-    if (!prepare(*frame, *g, pose, slots, coefficients, rows, *camera, *options, rgb, transmittance)) return 2;
-    const int H = camera->height, W = camera->width;
-    Comparison comparison(*target, H, W);
-    raster_compared(*frame, comparison, rgb, transmittance);
-    uncovered(*frame, [&](int lo, int hi) {
-        const size_t plane = (size_t)(hi - lo) * W;
-        std::vector<float> gradient(4 * plane);
-        comparison.rows(lo, hi, {rgb, transmittance, (size_t)H * W, W, 0}, {gradient.data(), gradient.data() + 3 * plane, plane, W, lo});
-    });
-    *counters = count(*frame), *loss = comparison.loss();
+                 const RsCamera *camera, const RsOptions *options, const RsTarget *target, RsCounters *counters, double *loss,
+                 double *squared_error) try {
+    if (!prepare(*frame, *g, pose, slots, coefficients, rows, *camera, *options)) return 2;
+    Comparison comparison(*target, camera->height, camera->width);
+    raster_compared(*frame, comparison);
+    uncovered(*frame, [&](int lo, int hi) { comparison.rows(lo, hi, {}, {}); });
+    *counters = count(*frame), *loss = comparison.loss(), *squared_error = comparison.squared_error();
     return 0;
 } catch (const std::bad_alloc &) {
     return 1;
@@ -141,9 +140,7 @@ static void finish(RsFrame &frame, const RsGaussians &g, const float *pose, floa
 
 int rs_render_backward(RsFrame *frame, const RsGaussians *g, const float *pose, const float *rgb, const float *transmittance,
                        const float *grad_rgb, const float *grad_transmittance, const RsGradients *out) try {
-    const int W = frame->camera.width;
-    const size_t plane = (size_t)frame->camera.height * W;
-    raster_backward(*frame, {rgb, transmittance, plane, W, 0}, {grad_rgb, grad_transmittance, plane, W, 0});
+    raster_backward(*frame, whole(frame->camera, rgb, transmittance), whole(frame->camera, grad_rgb, grad_transmittance));
     finish(*frame, *g, pose, 1.f, *out);
     return 0;
 } catch (const std::bad_alloc &) {

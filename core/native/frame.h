@@ -81,9 +81,9 @@ static inline Rows rows_of(const RsFrame &frame, const Slot &slot, int strip) {
 void project(const RsFrame &frame, const RsGaussians &gaussians, const float *pose, int slot, int begin, int end, Splat *projected);
 void bin(RsFrame &frame, int slot, const std::vector<Splat> &projected);
 void order(const RsFrame &frame, Slot &slot, int strip);
-void raster(RsFrame &frame, float *rgb, float *transmittance);
+void raster(RsFrame &frame, const Planes<float> &image);
 void raster_backward(RsFrame &frame, const Planes<const float> &image, const Planes<const float> &gradient);
-void raster_compared(RsFrame &frame, Comparison &comparison, float *rgb, float *transmittance);  // both, through the loss
+void raster_compared(RsFrame &frame, Comparison &comparison);  // both, through the loss; keeps no image
 void project_backward(RsFrame &frame, const RsGaussians &gaussians, const float *pose, float scale, const RsGradients &gradients);
 
 // Runs work within a parallel region, which no exception may leave: that memory ran out is noted, and thrown after it.

@@ -91,10 +91,11 @@ struct RsTarget {
 RS_API double rs_l1(const float *rgb, const float *transmittance, const RsTarget *target, int height, int width, int threads, float *grad_rgb,
                     float *grad_transmittance);
 
-// rs_render and rs_l1 in one pass: each strip is compared, and its gradient walked back to the splats, while it is in the cache.
+// The loss of rs_render's image, and the mean squared error of its colours over the background. In one pass that keeps no image:
+// each strip is drawn, compared, and its gradient walked back to the splats, while it is in the cache.
 RS_API int rs_render_l1(RsFrame *frame, const RsGaussians *gaussians, const float *pose, int slots, int coefficients, const RsRows *rows,
-                        const RsCamera *camera, const RsOptions *options, const RsTarget *target, float *rgb, float *transmittance,
-                        RsCounters *counters, double *loss);
+                        const RsCamera *camera, const RsOptions *options, const RsTarget *target, RsCounters *counters, double *loss,
+                        double *squared_error);
 
 // Gradients of `scale` times the loss that `frame` computed last, with the same arguments. Can be called once.
 RS_API int rs_render_l1_backward(RsFrame *frame, const RsGaussians *gaussians, const float *pose, float scale, const RsGradients *gradients);

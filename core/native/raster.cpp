@@ -110,29 +110,32 @@ static void blend_strip(const RsFrame &frame, const Slot &slot, int strip, const
     each_in_order(slot, strip, {c.r0, c.r1}, [&](Entry e, int lo, int hi) { walk<Blend>(slot.splats[e.splat], c.part(lo, hi), limits); });
 }
 
-// weight * canvas, on rows of the image: the first slot of a group sets them, the others add.
-static void emit(const RsFrame &frame, const Canvas &c, float weight, bool first, float *rgb, float *transmittance) {
-    size_t W = frame.camera.width, HW = frame.camera.height * W;
+// weight * canvas, on the image's columns: the first slot of a group sets them, the others add.
+static void emit(const Canvas &c, float weight, bool first, const Planes<float> &image) {
     auto put = [first](float *out, float value) { *out = first ? value : *out + value; };
+    const int left = c.x0 < c.x1 ? c.x0 : image.x1, n = c.x1 - c.x0, width = image.x1 - image.x0;
     for (int y = c.r0; y < c.r1; y++) {
-        float *out[4] = {transmittance + y * W, rgb + y * W, rgb + HW + y * W, rgb + 2 * HW + y * W};
+        const size_t start = image.at(y, image.x0);
+        float *out[4] = {image.transmittance + start, image.rgb + start, image.rgb + image.plane + start, image.rgb + 2 * image.plane + start};
         for (int p = 0; p < 4; p++) {
             const float *in = c.at(y, c.x0) + p * c.plane, outside = p ? 0.f : weight;
-            for (int x = 0; x < c.x0; x++) put(out[p] + x, outside);
-            for (int x = c.x0; x < c.x1; x++) put(out[p] + x, weight * (p ? in[x - c.x0] : std::fabs(in[x - c.x0])));
-            for (size_t x = c.x1; x < W; x++) put(out[p] + x, outside);
+            const int before = left - image.x0;
+            for (int x = 0; x < before; x++) put(out[p] + x, outside);
+            if (p) for (int x = 0; x < n; x++) put(out[p] + before + x, weight * in[x]);
+            else for (int x = 0; x < n; x++) put(out[p] + before + x, weight * std::fabs(in[x]));
+            for (int x = before + n; x < width; x++) put(out[p] + x, outside);
         }
     }
 }
 
-static void draw(RsFrame &frame, Task task, std::vector<float> &buffer, float *rgb, float *transmittance) {
+static void draw(RsFrame &frame, Task task, std::vector<float> &buffer, const Planes<float> &image) {
     const Group &group = frame.groups[task.group];
     for (int k = 0; k < group.slots; k++) {
         Slot &slot = frame.slots[group.first_slot + k];
         order(frame, slot, task.strip);
         Canvas c = open_canvas(frame, slot, task.strip, FORWARD_PLANES, buffer);
         blend_strip(frame, slot, task.strip, c);
-        emit(frame, c, slot.rows.weight, k == 0, rgb, transmittance);
+        emit(c, slot.rows.weight, k == 0, image);
     }
 }
 
@@ -146,7 +149,7 @@ static void open_gradient(const Slot &slot, const Canvas &c, const Canvas *own, 
     const float weight = slot.rows.weight;
     for (int y = c.r0; y < c.r1; y++) {
         float *t = c.at(y, c.x0), *rest = t + REST_PLANE * c.plane;
-        const size_t in = image.row(y) + c.x0, up = gradient.row(y) + c.x0;
+        const size_t in = image.at(y, c.x0), up = gradient.at(y, c.x0);
         std::fill(t, t + c.plane, 1.f), std::fill(rest + n, t + 2 * c.plane, 0.f);
         const float *g = gradient.transmittance + up, *T = own ? own->at(y, c.x0) : image.transmittance + in;
         for (int x = 0; x < n; x++) rest[x] = weight * g[x] * std::fabs(T[x]);
@@ -224,14 +227,14 @@ template <class Work> static void each_task(const RsFrame &frame, Work work) {
     attempt.settle();
 }
 
-static thread_local std::vector<float> forward_buffer, backward_buffer, gradient_buffer;
+static thread_local std::vector<float> forward_buffer, backward_buffer, strip_buffer;
 
 static void make_room_for_moments(RsFrame &frame) {
     for (int t = 0; t < frame.slot_count; t++) frame.slots[t].moments.resize(frame.slots[t].entries.size() * 16);
 }
 
-void raster(RsFrame &frame, float *rgb, float *transmittance) {
-    each_task(frame, [&](Task task) { draw(frame, task, forward_buffer, rgb, transmittance); });
+void raster(RsFrame &frame, const Planes<float> &image) {
+    each_task(frame, [&](Task task) { draw(frame, task, forward_buffer, image); });
 }
 
 void raster_backward(RsFrame &frame, const Planes<const float> &image, const Planes<const float> &gradient) {
@@ -240,18 +243,29 @@ void raster_backward(RsFrame &frame, const Planes<const float> &image, const Pla
     each_task(frame, [&](Task task) { walk_back(frame, task, limits, forward_buffer, backward_buffer, image, gradient); });
 }
 
-void raster_compared(RsFrame &frame, Comparison &comparison, float *rgb, float *transmittance) {
+// Planes for the columns that a task's splats reach.
+static Planes<float> open_strip(const RsFrame &frame, Task task, Rows rows, int image) {
+    const Group &group = frame.groups[task.group];
+    int x0 = MAX_SIZE, x1 = 0;
+    for (int k = 0; k < group.slots; k++) {
+        const Slot &slot = frame.slots[group.first_slot + k];
+        x0 = std::min<int>(x0, slot.strip_x_lo[task.strip]), x1 = std::max<int>(x1, slot.strip_x_hi[task.strip]);
+    }
+    if (x0 >= x1) x0 = x1 = 0;
+    const size_t plane = (size_t)(rows.hi - rows.lo) * (x1 - x0);
+    strip_buffer.resize(2 * 4 * plane);
+    float *p = strip_buffer.data() + image * 4 * plane;
+    return {p, p + 3 * plane, plane, x0, x1, rows.lo};
+}
+
+void raster_compared(RsFrame &frame, Comparison &comparison) {
     make_room_for_moments(frame);
     const Limits limits(frame.options);
-    const int W = frame.camera.width;
-    const Planes<const float> image{rgb, transmittance, (size_t)frame.camera.height * W, W, 0};
     each_task(frame, [&](Task task) {
-        draw(frame, task, forward_buffer, rgb, transmittance);
         const Rows rows = rows_of(frame, frame.slots[frame.groups[task.group].first_slot], task.strip);
-        const size_t plane = (size_t)(rows.hi - rows.lo) * W;
-        gradient_buffer.resize(4 * plane);
-        float *g = gradient_buffer.data();
-        comparison.rows(rows.lo, rows.hi, image, {g, g + 3 * plane, plane, W, rows.lo});
-        walk_back(frame, task, limits, forward_buffer, backward_buffer, image, {g, g + 3 * plane, plane, W, rows.lo});
+        const Planes<float> image = open_strip(frame, task, rows, 0), gradient = open_strip(frame, task, rows, 1);
+        draw(frame, task, forward_buffer, image);
+        comparison.rows(rows.lo, rows.hi, image, gradient);
+        walk_back(frame, task, limits, forward_buffer, backward_buffer, image, gradient);
     });
 }

@@ -87,7 +87,7 @@ def library() -> Any:
     lib.rs_l1.restype = ctypes.c_double
     float_ = ctypes.c_float
     lib.rs_l1.argtypes = [pointer] * 3 + [integer] * 3 + [pointer] * 2
-    lib.rs_render_l1.argtypes = [pointer, pointer, pointer, integer, integer, *[pointer] * 8]
+    lib.rs_render_l1.argtypes = [pointer, pointer, pointer, integer, integer, *[pointer] * 7]
     lib.rs_render_l1_backward.argtypes = [pointer, pointer, pointer, float_, pointer]
     lib.rs_pose.argtypes = [pointer, integer, pointer]
     lib.rs_pose_backward.argtypes = [pointer, integer, *[pointer] * 6]

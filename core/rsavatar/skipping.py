@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from rsavatar.imaging import NODES, Schedule, chebyshev_nodes
-from rsavatar.render.base import Rendering, Scene
+from rsavatar.render.base import Comparison, Rendering, Scene
 
 TOLERANCE_PX = 0.01  # of image motion; a shift of that much is 60 dB below the steepest edge
 REACH = 0.15  # metres: how far a body's surface is from its joints
@@ -112,7 +112,7 @@ class Work:
         self._sums: dict[str, float] = {}
         self._steps = 0
 
-    def add(self, scene: Scene, image: Rendering, full_size: tuple[int, int]) -> None:
+    def add(self, scene: Scene, image: Rendering | Comparison, full_size: tuple[int, int]) -> None:
         """Count one step."""
         slots, height, width = len(scene.rows), scene.camera.height, scene.camera.width
         one = {

@@ -17,10 +17,10 @@ from rsavatar.errors import DivergedError, Interrupted, expected
 from rsavatar.events import Note, Progress, Report
 from rsavatar.geometry.cameras import Camera
 from rsavatar.imaging import Actor, Schedule, expose
-from rsavatar.losses import dissimilarity, l1, render_l1
+from rsavatar.losses import compare, dissimilarity, render_l1
 from rsavatar.optimization import BLOCK, Saver, Settings, SkinBlock, State
 from rsavatar.painting import paint
-from rsavatar.render.base import Rendering, Scene
+from rsavatar.render.base import Comparison, Scene
 from rsavatar.skipping import Work
 
 REPORT_EVERY = 25  # steps
@@ -81,10 +81,10 @@ def fit(
 
         schedule = actor.timed(state.nodes.choose(index, seen.schedule) if settings.skips("nodes") else seen.schedule)
         scene = actor.scene(seen.frame, seen.camera, schedule, skin.weights, settings.degree(state.step))
-        image, error = _compare(scene, seen, settings)
-        loss = seen.weight * error
+        found = _compare(scene, seen, settings)
+        loss = seen.weight * found.loss
         state.note(index, float(loss.detach()), scene)
-        work.add(scene, image, seen.full_size)
+        work.add(scene, found, seen.full_size)
         if settings.lambda_reg:
             loss = loss + settings.lambda_reg * actor.motion.penalty(settings.continuity)
         torch.autograd.backward(loss)
@@ -94,7 +94,7 @@ def fit(
         last = state.step == settings.iterations
         if last or state.step % REPORT_EVERY == 0:
             saved = work.means(resting=len(state.doubt.trusted) - len(chosen))
-            report(replace(_progress(state, settings, float(loss.detach()), image, seen), work=saved))
+            report(replace(_progress(state, settings, float(loss.detach()), found.squared_error), work=saved))
         if last or settings.closes_block(state.step):
             skin.close(state.skin_optimizer)
             if rejected := state.close_block(actor):
@@ -116,13 +116,13 @@ def fit(
     return Trained(state.seconds, state.rejected, saver.path, doubted)
 
 
-def _compare(scene: Scene, seen: Observation, settings: Settings) -> tuple[Rendering, Tensor]:
-    """The image of a scene, and how far it is from what was seen. Without SSIM, both are found in one pass."""
+def _compare(scene: Scene, seen: Observation, settings: Settings) -> Comparison:
+    """How far the image of a scene is from what was seen. Without SSIM, no image is kept."""
     if not settings.ssim_weight:
         return render_l1(scene, seen.rgb, seen.mask, 0.0, settings.mask_weight)
     image = expose(scene)
-    error = l1(image, seen.rgb, seen.mask, 0.0, settings.mask_weight)
-    return image, error + settings.ssim_weight * dissimilarity(image, seen.rgb)
+    found = compare(image, seen.rgb, seen.mask, 0.0, settings.mask_weight)
+    return replace(found, loss=found.loss + settings.ssim_weight * dissimilarity(image, seen.rgb))
 
 
 def _begin(actor: Actor, observations: Sequence[Observation], settings: Settings, saver: Saver) -> State:
@@ -169,8 +169,7 @@ def _control_density(actor: Actor, state: State, settings: Settings, rules: Dens
     return f"step {state.step}: {before} -> {actor.avatar.count} Gaussians ({changes})"
 
 
-def _progress(state: State, settings: Settings, loss: float, image: Rendering, seen: Observation) -> Progress:
-    error = image.rgb.detach() - seen.rgb / 255
-    psnr = -10 * math.log10(max(float(error.square().mean()), 1e-12))
+def _progress(state: State, settings: Settings, loss: float, squared_error: float) -> Progress:
+    psnr = -10 * math.log10(max(squared_error, 1e-12))
     count = len(state.gradients.total)
     return Progress("train", state.step, settings.iterations, state.seconds, loss, psnr, count)

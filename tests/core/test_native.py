@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, replace
-from typing import Any
 
 import pytest
 import torch
@@ -11,9 +11,9 @@ from torch import Tensor
 
 from rsavatar import kernels
 from rsavatar.errors import KernelError
-from rsavatar.losses import l1
+from rsavatar.losses import compare
 from rsavatar.render import native, reference
-from rsavatar.render.base import Gaussians, Options, Rendering, Scene, TimedRows
+from rsavatar.render.base import Comparison, Gaussians, Options, Rendering, Scene, TimedRows
 from tests.core import scenes
 
 pytestmark = pytest.mark.skipif(not kernels.available(), reason="no native kernels were built for this machine")
@@ -52,30 +52,30 @@ def test_image_and_gradients_of_every_input_equal_the_twin(kind: str, bases: int
         assert error < 1e-4, f"gradient of {name}: relative error {error:.1e}"
 
 
-def losses(render_l1: object, kind: str) -> tuple[Rendering, float, dict[str, Tensor]]:
-    """Three times the loss of a scene against noise, over grey, with its gradients."""
+Compare = Callable[[Scene, Tensor, Tensor, float, float], Comparison]
+
+
+def in_two_passes(s: Scene, target: Tensor, mask: Tensor, background: float, mask_weight: float) -> Comparison:
+    return compare(native.render(s), target, mask, background, mask_weight)
+
+
+def losses(through: Compare, kind: str) -> tuple[Comparison, dict[str, Tensor]]:
+    """A scene against noise, over grey, with the gradients of three times the loss."""
     s, tensors = leaves(scenes.scene(kind, count=400, dtype=torch.float32))
     noise = torch.Generator().manual_seed(1)
     target = torch.randint(0, 256, (4, scenes.HEIGHT, scenes.WIDTH), generator=noise, dtype=torch.uint8)
-    image, loss = render_l1(s, target[:3], target[3], 0.3, 0.1)  # type: ignore[operator]
-    (3 * loss).backward()
-    return image, float(loss.detach()), {name: x.grad for name, x in tensors.items() if x.grad is not None}
-
-
-def in_two_passes(s: Scene, *compared: Any) -> tuple[Rendering, Tensor]:
-    image = native.render(s)
-    return image, l1(image, *compared)
+    found = through(s, target[:3], target[3], 0.3, 0.1)
+    torch.autograd.backward(3 * found.loss)
+    return found, {name: x.grad for name, x in tensors.items() if x.grad is not None}
 
 
 @pytest.mark.parametrize("kind", scenes.KINDS)
 def test_one_pass_through_the_loss_equals_two(kind: str) -> None:
-    image, loss, expected = losses(in_two_passes, kind)
-    fused, same, got = losses(native.render_l1, kind)
-    assert torch.equal(fused.rgb, image.rgb)
-    assert torch.equal(fused.transmittance, image.transmittance)
-    assert not fused.rgb.requires_grad
-    assert (fused.splats, fused.pairs, fused.broken) == (image.splats, image.pairs, image.broken)
-    assert same == loss
+    wanted, expected = losses(in_two_passes, kind)
+    found, got = losses(native.render_l1, kind)
+    assert float(found.loss.detach()) == pytest.approx(float(wanted.loss.detach()), rel=1e-6)
+    assert found.squared_error == pytest.approx(wanted.squared_error, rel=1e-5)
+    assert (found.splats, found.pairs, found.broken) == (wanted.splats, wanted.pairs, wanted.broken)
     assert set(got) == set(expected)
     for name, want in expected.items():
         torch.testing.assert_close(got[name], want, rtol=1e-4, atol=1e-6 * float(want.abs().max()))
@@ -90,9 +90,18 @@ def test_one_pass_gives_the_same_bits_with_any_number_of_threads(kind: str) -> N
             runs.append(losses(native.render_l1, kind))
     finally:
         kernels.use_threads(before)
-    for _, loss, grads in runs[1:]:
-        assert loss == runs[0][1]
-        assert all(torch.equal(grads[name], runs[0][2][name]) for name in grads)
+    for found, grads in runs[1:]:
+        assert float(found.loss.detach()) == float(runs[0][0].loss.detach())
+        assert all(torch.equal(grads[name], runs[0][1][name]) for name in grads)
+
+
+def test_one_pass_over_nothing_to_see() -> None:
+    s = scenes.scene("part", dtype=torch.float32)
+    away = replace(s, gaussians=replace(s.gaussians, means=s.gaussians.means + 100.0))
+    target = torch.full((4, scenes.HEIGHT, scenes.WIDTH), 51, dtype=torch.uint8)
+    found = native.render_l1(away, target[:3], target[3], 0.5, 2.0)
+    assert float(found.loss) == pytest.approx(0.1 + 2.0 * 0.2, rel=1e-6)  # |0 - 0.2 + 0.5 * 0.2|, and |0 - 0.2|
+    assert found.squared_error == pytest.approx(0.01, rel=1e-6)
 
 
 def test_a_target_of_another_size_is_refused() -> None:

@@ -22,7 +22,7 @@ from rsavatar.methods.base import body_box
 from rsavatar.motion.base import JOINTS, InitialMotion
 from rsavatar.motion.spline import FrameSpline
 from rsavatar.optimization import BLOCK, Settings, SkinBlock, State
-from rsavatar.render.base import Options, Rendering, Scene
+from rsavatar.render.base import Options, Scene
 from rsavatar.train import Observation
 
 Array = npt.NDArray[np.float64]
@@ -42,7 +42,7 @@ class Training:
         body = build(size)
         self._seen = _observe(body, way)
         self._actor = _actor(body, size, frames)
-        self._compare = _whole_l1 if way.whole else render_l1
+        self._loss = _loss_of_whole if way.whole else _loss
         self._settings = Settings(
             iterations=20_000,
             seed=0,
@@ -65,7 +65,7 @@ class Training:
         state.set_rates(settings)
         degree = settings.degree(state.step)
         scene = actor.scene(seen.frame, seen.camera, seen.schedule, self._skin.weights, degree)
-        _, loss = self._compare(scene, seen.rgb, seen.mask, 0.0, settings.mask_weight)
+        loss = self._loss(scene, seen, settings)
         loss = loss + settings.lambda_reg * actor.motion.penalty(settings.continuity)
         torch.autograd.backward(loss)
         state.advance(actor, scene.gaussians.screen, loss.detach(), seen.full_size)
@@ -81,11 +81,12 @@ class Training:
         return step_ms + refresh_ms / BLOCK
 
 
-def _whole_l1(
-    scene: Scene, target: Tensor, mask: Tensor, background: float, mask_weight: float
-) -> tuple[Rendering, Tensor]:
-    image = compose_whole(scene)
-    return image, l1(image, target, mask, background, mask_weight)
+def _loss(scene: Scene, seen: Observation, settings: Settings) -> Tensor:
+    return render_l1(scene, seen.rgb, seen.mask, 0.0, settings.mask_weight).loss
+
+
+def _loss_of_whole(scene: Scene, seen: Observation, settings: Settings) -> Tensor:
+    return l1(compose_whole(scene), seen.rgb, seen.mask, 0.0, settings.mask_weight)
 
 
 def _observe(body: MovingBody, way: Way) -> Observation:

@@ -76,6 +76,20 @@ class Rendering:
 
 
 @dataclass(frozen=True)
+class Comparison:
+    """How far an image is from another; the image itself is not kept.
+
+    ``loss`` is a differentiable scalar, ``squared_error`` the mean over the colours; counters as in ``Rendering``.
+    """
+
+    loss: Tensor
+    squared_error: float
+    splats: int = 0
+    pairs: int = 0
+    broken: int = 0
+
+
+@dataclass(frozen=True)
 class Options:
     """Constants of the image formation, the same for every backend."""
 

@@ -6,7 +6,6 @@ Layouts are those of ``core/native/layout.h``; tensors cross without a copy. The
 from __future__ import annotations
 
 import ctypes
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -17,7 +16,7 @@ from torch import Tensor
 from rsavatar.errors import KernelError, expected
 from rsavatar.geometry.cameras import Camera
 from rsavatar.kernels import Target, library, threads
-from rsavatar.render.base import Gaussians, Options, Rendering, Scene, TimedRows
+from rsavatar.render.base import Comparison, Gaussians, Options, Rendering, Scene, TimedRows
 
 _FIELDS = ("means", "rotations", "log_scales", "opacity_logits", "sh", "skin_weights", "screen")
 _Pointer = ctypes.c_void_p
@@ -74,7 +73,6 @@ class _Static:
     rows: tuple[TimedRows, ...]
     camera: Camera
     options: Options
-    target: Target | None = None
 
 
 _FLAGS = {"shear": 1, "implicit": 2, "resort": 4}
@@ -120,57 +118,68 @@ def _check(code: int) -> None:
 
 
 class _Render(torch.autograd.Function):
-    """rgb, transmittance, loss = f(the seven tensors of ``Gaussians``, pose); see ``rs_render`` in layout.h.
-
-    With a target only the loss is differentiable, and its gradient is on its way already; without one, only the image.
-    """
+    """rgb, transmittance = f(the seven tensors of ``Gaussians``, pose); see ``rs_render`` in layout.h."""
 
     @staticmethod
-    def forward(ctx: Any, static: _Static, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        frame, camera = _Frame(), static.camera
+    def forward(ctx: Any, static: _Static, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        camera, counters = static.camera, _Counters()
         tensors = tuple(t.detach().contiguous() for t in tensors)
-        pose, counters, loss = tensors[7], _Counters(), ctypes.c_double(math.nan)
         rgb, transmittance = torch.empty(3, camera.height, camera.width), torch.empty(camera.height, camera.width)
-        rows = (_Rows * len(static.rows))(*(_Rows(r.lo, r.hi, r.rate, r.start, r.weight) for r in static.rows))
-        what = (frame.handle, ctypes.byref(_c_gaussians(tensors)), pose.data_ptr(), *pose.shape[:2], ctypes.byref(rows))
-        how = (ctypes.byref(_c_camera(camera)), ctypes.byref(_c_options(static.options)))
-        found = (rgb.data_ptr(), transmittance.data_ptr(), ctypes.byref(counters))
-        if static.target is None:
-            code = library().rs_render(*what, *how, *found)
-        else:
-            code = library().rs_render_l1(*what, *how, ctypes.byref(static.target), *found, ctypes.byref(loss))
-        _check(code)
-        ctx.frame = frame if any(ctx.needs_input_grad) else None
-        ctx.compared = static.target is not None
+        image = (rgb.data_ptr(), transmittance.data_ptr())
+        _draw(ctx, library().rs_render, static, tensors, *image, ctypes.byref(counters))
         ctx.save_for_backward(*tensors, rgb, transmittance)
-        ctx.set_materialize_grads(False)
         counted = torch.tensor([counters.splats, counters.pairs, counters.broken])
-        value = torch.tensor(loss.value, dtype=torch.float64)
-        ctx.mark_non_differentiable(counted, *((rgb, transmittance) if ctx.compared else (value,)))
-        return rgb, transmittance, value, counted
+        ctx.mark_non_differentiable(counted)
+        return rgb, transmittance, counted
 
     @staticmethod
-    def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         *tensors, rgb, transmittance = ctx.saved_tensors
-        if ctx.frame is None:
-            raise KernelError(expected("native render", "one backward for one forward", "a second backward"))
-        needs = ctx.needs_input_grad[1:]
-        wanted = [torch.empty_like(t) if need else None for t, need in zip(tensors, needs, strict=True)]
-        gradients = ctypes.byref(_Gradients(*(None if t is None else t.data_ptr() for t in wanted)))
-        what = (ctx.frame.handle, ctypes.byref(_c_gaussians(tuple(tensors))), tensors[7].data_ptr())
-        if ctx.compared:
-            code = library().rs_render_l1_backward(*what, _scalar(upstream[2]), gradients)
-        else:
-            image = (rgb, transmittance)
-            sent = [torch.zeros_like(t) if g is None else g.contiguous() for g, t in zip(upstream, image, strict=False)]
-            code = library().rs_render_backward(*what, *(t.data_ptr() for t in (*image, *sent)), gradients)
-        ctx.frame = None  # back to the pool
-        _check(code)
-        return (None, *wanted)
+        images = (rgb, transmittance, upstream[0].contiguous(), upstream[1].contiguous())
+        return None, *_gradients(ctx, library().rs_render_backward, tuple(tensors), *(t.data_ptr() for t in images))
 
 
-def _scalar(upstream: Tensor | None) -> float:
-    return 0.0 if upstream is None else float(upstream)
+class _RenderL1(torch.autograd.Function):
+    """The loss of that image as a function of the same; see ``rs_render_l1``."""
+
+    @staticmethod
+    def forward(ctx: Any, static: _Static, target: Target, *tensors: Tensor) -> tuple[Tensor, Tensor]:
+        counters, loss, squared = _Counters(), ctypes.c_double(), ctypes.c_double()
+        tensors = tuple(t.detach().contiguous() for t in tensors)
+        found = (ctypes.byref(counters), ctypes.byref(loss), ctypes.byref(squared))
+        _draw(ctx, library().rs_render_l1, static, tensors, ctypes.byref(target), *found)
+        ctx.save_for_backward(*tensors)
+        others = torch.tensor([squared.value, counters.splats, counters.pairs, counters.broken], dtype=torch.float64)
+        ctx.mark_non_differentiable(others)
+        return torch.tensor(loss.value, dtype=torch.float64), others
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        return None, None, *_gradients(ctx, library().rs_render_l1_backward, ctx.saved_tensors, float(upstream[0]))
+
+
+def _draw(ctx: Any, call: Callable[..., int], static: _Static, tensors: _Tensors, *rest: Any) -> None:
+    """``call`` on a scene in a frame of its own, which is kept where a gradient is wanted."""
+    frame, pose = _Frame(), tensors[7]
+    rows = (_Rows * len(static.rows))(*(_Rows(r.lo, r.hi, r.rate, r.start, r.weight) for r in static.rows))
+    what = (frame.handle, ctypes.byref(_c_gaussians(tensors)), pose.data_ptr(), *pose.shape[:2], ctypes.byref(rows))
+    how = (ctypes.byref(_c_camera(static.camera)), ctypes.byref(_c_options(static.options)))
+    _check(call(*what, *how, *rest))
+    ctx.frame = frame if any(ctx.needs_input_grad) else None
+
+
+def _gradients(ctx: Any, call: Callable[..., int], tensors: _Tensors, *rest: Any) -> list[Tensor | None]:
+    """What ``call`` writes for those of ``tensors`` that need a gradient."""
+    if ctx.frame is None:
+        raise KernelError(expected("native render", "one backward for one forward", "a second backward"))
+    needs = ctx.needs_input_grad[-len(tensors) :]
+    wanted = [torch.empty_like(t) if need else None for t, need in zip(tensors, needs, strict=True)]
+    gradients = _Gradients(*(None if t is None else t.data_ptr() for t in wanted))
+    what = (ctx.frame.handle, ctypes.byref(_c_gaussians(tensors)), tensors[7].data_ptr())
+    code = call(*what, *rest, ctypes.byref(gradients))
+    ctx.frame = None  # back to the pool
+    _check(code)
+    return wanted
 
 
 def render(scene: Scene) -> Rendering:
@@ -182,16 +191,12 @@ def render(scene: Scene) -> Rendering:
         KernelError: if a tensor is not float32 on the CPU or of a wrong shape, if slots' rows partly overlap or leave
             the image, or if no kernel library fits this machine.
     """
-    rgb, transmittance, _, counted = _apply(_Static(scene.rows, scene.camera, scene.options), *_inputs(scene))
+    rgb, transmittance, counted = _apply(_Static(scene.rows, scene.camera, scene.options), *_inputs(scene))
     return Rendering(rgb, transmittance, *counted.tolist())
 
 
-def render_l1(
-    scene: Scene, target: Tensor, mask: Tensor, background: float, mask_weight: float
-) -> tuple[Rendering, Tensor]:
-    """``render(scene)`` and its ``losses.l1`` in one pass: a strip is compared, and walked back, while it is at hand.
-
-    Only the loss is differentiable, the image is not.
+def render_l1(scene: Scene, target: Tensor, mask: Tensor, background: float, mask_weight: float) -> Comparison:
+    """``losses.l1`` of ``render(scene)``, differentiable as that: each strip is compared and walked back while at hand.
 
     Raises:
         KernelError: as ``render``; or if target or mask are not bytes [3, H, W] and [H, W].
@@ -202,12 +207,13 @@ def render_l1(
             raise KernelError(expected(name, f"torch.uint8 {shape}", f"{tensor.dtype} {tuple(tensor.shape)}"))
     target, mask = target.contiguous(), mask.contiguous()
     compared = Target(target.data_ptr(), mask.data_ptr(), background, mask_weight)
-    static = _Static(scene.rows, scene.camera, scene.options, compared)
-    rgb, transmittance, loss, counted = _apply(static, *_inputs(scene))
-    return Rendering(rgb, transmittance, *counted.tolist()), loss
+    loss, others = _apply_l1(_Static(scene.rows, scene.camera, scene.options), compared, *_inputs(scene))
+    squared, *counted = others.tolist()
+    return Comparison(loss, squared, *map(int, counted))
 
 
-_apply: Callable[..., tuple[Tensor, Tensor, Tensor, Tensor]] = _Render.apply  # torch leaves apply untyped
+_apply: Callable[..., tuple[Tensor, Tensor, Tensor]] = _Render.apply  # torch leaves apply untyped
+_apply_l1: Callable[..., tuple[Tensor, Tensor]] = _RenderL1.apply
 
 
 def _inputs(scene: Scene) -> _Tensors:
