@@ -127,28 +127,17 @@ int rs_render_l1(RsFrame *frame, const RsGaussians *g, const float *pose, int sl
     return 1;
 }
 
-// From the moments to the gradients, which are cleared first.
-static void finish(RsFrame &frame, const RsGaussians &g, const float *pose, float scale, const RsGradients &out) {
-    size_t M = g.count;
-    auto zero = [M](float *p, size_t rows) {
-        if (p) std::fill(p, p + rows * M, 0.f);
-    };
-    zero(out.means, 3), zero(out.rotations, 4), zero(out.log_scales, 3), zero(out.opacity_logits, 1);
-    zero(out.sh, 3 * (size_t)g.bases), zero(out.skin_weights, JOINTS), zero(out.screen, 2);
-    project_backward(frame, g, pose, scale, out);
-}
-
 int rs_render_backward(RsFrame *frame, const RsGaussians *g, const float *pose, const float *rgb, const float *transmittance,
                        const float *grad_rgb, const float *grad_transmittance, const RsGradients *out) try {
     raster_backward(*frame, whole(frame->camera, rgb, transmittance), whole(frame->camera, grad_rgb, grad_transmittance));
-    finish(*frame, *g, pose, 1.f, *out);
+    project_backward(*frame, *g, pose, 1.f, *out);
     return 0;
 } catch (const std::bad_alloc &) {
     return 1;
 }
 
 int rs_render_l1_backward(RsFrame *frame, const RsGaussians *g, const float *pose, float scale, const RsGradients *out) try {
-    finish(*frame, *g, pose, scale, *out);
+    project_backward(*frame, *g, pose, scale, *out);
     return 0;
 } catch (const std::bad_alloc &) {
     return 1;

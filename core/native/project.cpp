@@ -309,6 +309,14 @@ static void backward_block(const RsFrame &frame, const RsGaussians &g, const RsG
     through_blend(block, g, out, pose, D, tau, t, sums);
 }
 
+static void clear(const RsGradients &out, const RsGaussians &g, int begin, int end) {
+    auto zero = [&](float *p, int rows) {
+        for (int i = 0; p && i < rows; i++) std::fill(p + (size_t)i * g.count + begin, p + (size_t)i * g.count + end, 0.f);
+    };
+    zero(out.means, 3), zero(out.rotations, 4), zero(out.log_scales, 3), zero(out.opacity_logits, 1);
+    zero(out.sh, 3 * g.bases), zero(out.skin_weights, JOINTS), zero(out.screen, 2);
+}
+
 // Chunks of Gaussian ids, as many for one thread as for sixty: each chunk walks all slots in order and owns its rows of
 // every gradient; the pose sums of the chunks are added in order. So the result does not depend on the threads.
 constexpr int CHUNKS = 16;
@@ -321,6 +329,7 @@ void project_backward(RsFrame &frame, const RsGaussians &g, const float *pose, f
 #pragma omp parallel for schedule(dynamic, 1) num_threads(frame.options.threads)
     for (int chunk = 0; chunk < CHUNKS; chunk++) attempt([&, chunk] {
         int32_t begin = (int64_t)g.count * chunk / CHUNKS, end = (int64_t)g.count * (chunk + 1) / CHUNKS;
+        clear(out, g, begin, end);
         std::vector<Floats> sums(n);
         for (int t = 0; t < T; t++) {
             const Slot &slot = frame.slots[t];
