@@ -41,16 +41,12 @@ struct Slot {
     int strips;
     int broken;                        // Gaussians whose fate that was
     std::vector<int32_t> ids;          // surviving Gaussians, ascending
-    std::vector<float> tau;            // of the survivors
     std::vector<Splat> splats;         // theirs
     std::vector<int32_t> first_pair;   // splat -> its first pair; a splat's pairs are its strips, from the top; [n + 1]
-    std::vector<int32_t> first_strip;  // of a splat
     std::vector<int32_t> strip_begin;  // strip -> its first entry; [strips + 1]
     std::vector<int16_t> strip_x_lo, strip_x_hi;  // columns that the strip's splats reach
     std::vector<Entry> entries;        // the strips' lists, by depth
     std::vector<float> moments;        // [pairs][16], written by the backward raster
-    std::vector<uint32_t> keys, keys2;     // depths of the splats in `order`
-    std::vector<int32_t> order, order2;
 };
 
 struct Group {  // slots that share their rows
@@ -70,7 +66,7 @@ struct RsFrame {
     std::vector<Group> groups;
     std::vector<Task> tasks;
     std::vector<Splat> projected;      // every Gaussian in the only slot; of several slots, each thread has its own
-    std::vector<float> pose_sums;      // [chunks][T][D * 24 * 12]
+    std::vector<float> pose_sums;      // [chunks][slots at a time][D * 24 * 12]
 };
 
 static inline Rows rows_of(const RsFrame &frame, const Slot &slot, int strip) {

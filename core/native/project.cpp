@@ -266,7 +266,7 @@ static void backward_block(const RsFrame &frame, const RsGaussians &g, const RsG
     float rate = slot.rows.rate;
     Floats tau = {};
     for (int i = 0; i < LANES; i++)
-        if (block.live[i]) tau[i] = slot.tau[block.survivors[i]];
+        if (block.live[i]) tau[i] = slot.splats[block.survivors[i]].tau;
     Blend blend;
     blend_pose(block, g, pose, D, blend);
     Vec3 x = mean_of(block, g);
@@ -317,21 +317,21 @@ static void clear(const RsGradients &out, const RsGaussians &g, int begin, int e
     zero(out.sh, 3 * g.bases), zero(out.skin_weights, JOINTS), zero(out.screen, 2);
 }
 
-// Chunks of Gaussian ids, as many for one thread as for sixty: each chunk walks all slots in order and owns its rows of
+// Chunks of Gaussian ids, as many for one thread as for sixty: each chunk walks the slots in order and owns its rows of
 // every gradient; the pose sums of the chunks are added in order. So the result does not depend on the threads.
 constexpr int CHUNKS = 16;
+constexpr int SLOTS_AT_A_TIME = 32;  // what bounds the memory of the sums
 
-void project_backward(RsFrame &frame, const RsGaussians &g, const float *pose, float scale, const RsGradients &out) {
-    int D = frame.coefficients, T = frame.slot_count;
-    size_t n = (size_t)D * JOINTS * 12;
-    frame.pose_sums.assign(out.pose ? CHUNKS * T * n : 0, 0.f);
+static void slots_backward(RsFrame &frame, const RsGaussians &g, const float *pose, float scale, const RsGradients &out, int from, int to) {
+    const size_t n = (size_t)frame.coefficients * JOINTS * 12, slots = to - from;
+    frame.pose_sums.assign(out.pose ? CHUNKS * slots * n : 0, 0.f);
     Attempt attempt;
 #pragma omp parallel for schedule(dynamic, 1) num_threads(frame.options.threads)
     for (int chunk = 0; chunk < CHUNKS; chunk++) attempt([&, chunk] {
         int32_t begin = (int64_t)g.count * chunk / CHUNKS, end = (int64_t)g.count * (chunk + 1) / CHUNKS;
-        clear(out, g, begin, end);
+        if (from == 0) clear(out, g, begin, end);
         std::vector<Floats> sums(n);
-        for (int t = 0; t < T; t++) {
+        for (int t = from; t < to; t++) {
             const Slot &slot = frame.slots[t];
             int first = std::lower_bound(slot.ids.begin(), slot.ids.end(), begin) - slot.ids.begin();
             int last = std::lower_bound(slot.ids.begin() + first, slot.ids.end(), end) - slot.ids.begin();
@@ -343,14 +343,19 @@ void project_backward(RsFrame &frame, const RsGaussians &g, const float *pose, f
                 k += block.used;
             }
             if (out.pose)
-                for (size_t i = 0; i < n; i++) frame.pose_sums[(chunk * (size_t)T + t) * n + i] = sum(sums[i]);
+                for (size_t i = 0; i < n; i++) frame.pose_sums[(chunk * slots + t - from) * n + i] = sum(sums[i]);
         }
     });
     attempt.settle();
     if (out.pose)
-        for (size_t i = 0; i < T * n; i++) {
+        for (size_t i = 0; i < slots * n; i++) {
             float s = 0.f;
-            for (int chunk = 0; chunk < CHUNKS; chunk++) s += frame.pose_sums[chunk * T * n + i];
-            out.pose[i] = s;
+            for (int chunk = 0; chunk < CHUNKS; chunk++) s += frame.pose_sums[chunk * slots * n + i];
+            out.pose[from * n + i] = s;
         }
+}
+
+void project_backward(RsFrame &frame, const RsGaussians &g, const float *pose, float scale, const RsGradients &out) {
+    for (int from = 0; from < frame.slot_count; from += SLOTS_AT_A_TIME)
+        slots_backward(frame, g, pose, scale, out, from, std::min(from + SLOTS_AT_A_TIME, frame.slot_count));
 }
