@@ -12,16 +12,19 @@ from torch import Tensor
 from rsavatar import checkpoint
 from rsavatar.adam import Adam, Moments
 from rsavatar.avatar.density import DensityRules, Edit, ScreenGradients
+from rsavatar.avatar.networks import refine
 from rsavatar.doubt import Doubt
 from rsavatar.errors import DivergedError, expected
 from rsavatar.events import Checkpointed
 from rsavatar.imaging import Actor
 from rsavatar.motion.base import Continuity
+from rsavatar.parallel import spread
 from rsavatar.render.base import Scene
 from rsavatar.skipping import Nodes, Settled
 from rsavatar.spec import SKIPS, Skip
 
 BLOCK = 50  # steps between refreshes of the skinning weights; all that saves state happens between blocks
+CHUNK = 2048  # Gaussians: what a layer of the skinning network makes of so many stays in a core's cache
 MOST_REJECTED = 50  # rejected steps in a row before training is called diverged
 DOUBT_AFTER = 500  # steps: before, losses tell how far the avatar has come with an image
 FAR = 3.0  # times the best block's mean loss: diverged. Sound runs, density control included, stayed within twice
@@ -91,19 +94,34 @@ class Settings:
 class SkinBlock:
     """Skinning weights of one block of steps: computed once, their gradient summed, one network step at the end.
 
-    The offset network sees canonical positions only, and those hardly move within a block.
+    The offset network sees canonical positions only, and those hardly move within a block. It is evaluated, and
+    walked back, ``CHUNK`` Gaussians at a time.
     """
 
     def __init__(self, actor: Actor) -> None:
-        self._refined = actor.skin_weights()
-        self.weights = self._refined.detach().requires_grad_(self._refined.requires_grad)
+        self._network = actor.skin_offset
+        if self._network is None:
+            self.weights = actor.avatar.prior
+            return
+        count, network = actor.avatar.count, self._network
+        means, prior = actor.avatar.means.detach(), actor.avatar.prior
+        self._chunks = [slice(first, first + CHUNK) for first in range(0, count, CHUNK)]
+        self._refined = spread(lambda part: refine(prior[:, part], network(means[:, part])), self._chunks)
+        self.weights = torch.cat([refined.detach() for refined in self._refined], 1).requires_grad_()
 
     def close(self, optimizer: Adam) -> None:
         """Hand the summed gradient to the network and take its step; non-finite sums are dropped."""
         gradient = self.weights.grad
-        if gradient is None or not math.isfinite(float(gradient.sum())):
+        if self._network is None or gradient is None or not math.isfinite(float(gradient.sum())):
             return
-        torch.autograd.backward(self._refined, gradient)
+        parameters = list(self._network.parameters())
+
+        def walk_back(place: int) -> tuple[Tensor, ...]:
+            return torch.autograd.grad(self._refined[place], parameters, gradient[:, self._chunks[place]])
+
+        parts = spread(walk_back, range(len(self._chunks)))
+        for parameter, *found in zip(parameters, *parts, strict=True):
+            parameter.grad = torch.stack(found).sum(0)
         optimizer.advance()
         optimizer.forget()
 

@@ -10,7 +10,8 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from rsavatar import kernels
+from rsavatar import kernels, optimization
+from rsavatar.adam import Adam
 from rsavatar.avatar.density import DensityRules
 from rsavatar.checkpoint import Owner
 from rsavatar.errors import CheckpointError, DivergedError, Interrupted
@@ -19,7 +20,7 @@ from rsavatar.methods.base import AbstractMethod, build_actor, observations, set
 from rsavatar.methods.blur import BlurAvatar
 from rsavatar.methods.oblivious import ShutterObliviousAvatar
 from rsavatar.methods.rolling import RollingShutterAvatar
-from rsavatar.optimization import BLOCK, Rates, Saver, Settings
+from rsavatar.optimization import BLOCK, Rates, Saver, Settings, SkinBlock
 from rsavatar.train import Trained, fit, pick
 from tests.core import small_subject
 
@@ -115,6 +116,39 @@ def test_the_number_of_threads_does_not_change_the_result(tmp_path: Path) -> Non
     finally:
         kernels.use_threads(before)
     assert_same(*results)
+
+
+def test_skinning_weights_in_chunks_are_those_of_one_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(optimization, "CHUNK", 48)
+    method, networks, before = RollingShutterAvatar(), [], kernels.threads()
+    try:
+        for threads in (1, 2, None):  # None: torch's own way
+            actor = build_actor(method, small_subject.case())
+            network = actor.skin_offset
+            assert network is not None
+            torch.nn.init.normal_(network.head.weight, std=0.1, generator=torch.Generator().manual_seed(2))
+            start = [p.detach().clone() for p in network.parameters()]
+            adam = Adam([{"params": list(network.parameters())}], 1.0, epsilon=1.0)  # a step is g / (|g| + 1)
+            gradient = torch.randn(actor.avatar.prior.shape, generator=torch.Generator().manual_seed(1))
+            if threads is None:
+                weights = actor.skin_weights()
+                weights.backward(gradient)  # type: ignore[no-untyped-call]
+                adam.advance()
+            else:
+                kernels.use_threads(threads)
+                block = SkinBlock(actor)
+                weights, block.weights.grad = block.weights, gradient
+                block.close(adam)
+            moved = [p.detach() - old for p, old in zip(network.parameters(), start, strict=True)]
+            networks.append((weights.detach(), moved))
+    finally:
+        kernels.use_threads(before)
+    one, two, whole = networks
+    assert torch.equal(one[0], two[0])
+    assert all(torch.equal(a, b) for a, b in zip(one[1], two[1], strict=True))
+    torch.testing.assert_close(one[0], whole[0])
+    torch.testing.assert_close(one[1], whole[1], rtol=1e-3, atol=1e-5)
+    assert all(float(change.abs().max()) > 0.01 for change in one[1])
 
 
 def test_a_checkpoint_of_another_job_is_refused(tmp_path: Path) -> None:
