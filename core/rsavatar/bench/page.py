@@ -31,7 +31,7 @@ splats lie so close in depth that float32 (2.4e-7 m there) puts the wrong one in
 points of a fixed linear functional of the image: the one that a squared error against the truth shifted by 3 pixels
 sends back.
 
-**Times** are medians of n rounds in which every way takes its turn, after a warm-up: the image alone, and the image
+**Times** are medians of n rounds in which every way takes its turn, after doing it once: the image alone, and the image
 with the gradients of all eight inputs of the renderer (poses and skinning weights included), on the whole frame. All
 ways run on the same kernels. "The paper's way" renders {K} whole images and takes a band of rows from each; bands
 render only their own rows; own time poses every Gaussian at the instant when the scan meets it. The torch twin is

@@ -72,6 +72,8 @@ class Training:
 
     def refresh(self) -> None:
         """What ``train.fit`` does between blocks of steps: the skinning network's step and its new weights."""
+        if self._skin.weights.grad is None:  # what a block of steps would have left there
+            self._skin.weights.grad = torch.zeros_like(self._skin.weights)
         self._skin.close(self._state.skin_optimizer)
         self._skin = SkinBlock(self._actor)
 
