@@ -33,9 +33,10 @@ sends back.
 
 **Times** are medians of n rounds in which every way takes its turn, after doing it once: the image alone, and the image
 with the gradients of all eight inputs of the renderer (poses and skinning weights included), on the whole frame. All
-ways run on the same kernels. "The paper's way" renders {K} whole images and takes a band of rows from each; bands
-render only their own rows; own time poses every Gaussian at the instant when the scan meets it. The torch twin is
-this package's own float64 reference in plain torch: {twin}.
+ways run on the same kernels. "In one pass" is what training takes: each strip is drawn, compared with bytes and walked
+back to the splats while it is in the cache, and no image is kept. "The paper's way" renders {K} whole images and
+takes a band of rows from each; bands render only their own rows; own time poses every Gaussian at the instant when
+the scan meets it. The torch twin is this package's own float64 reference in plain torch: {twin}.
 """
 GROWTH = """\
 **What is measured.** Scene P13 with one size changed at a time. More Gaussians are smaller ones, so that the body stays
@@ -47,8 +48,9 @@ of the process's resident memory in a process of its own, in forward and backwar
 MILLISECONDS = (
     "Milliseconds are of the processor above under the load above; the ratios are what carries over. The target was "
     "set with prototypes on a processor of 16 lanes; their plain build of 8 lanes takes 34 ms on one thread of an AMD "
-    "EPYC with AVX2, on a scene of its own with fewer pixels. What each part of these kernels gives there: "
-    "docs/decisions/0017. What is left is the rasteriser: 433 000 vectors of 8 pixels forward, as many backward."
+    "EPYC with AVX2, on a scene of its own with fewer pixels. What each part of these kernels gives there, and what "
+    "was tried beyond: docs/decisions/0017. What is left is two thirds rasteriser: 435 000 vectors of 8 pixels forward, as "
+    "many backward, each with an exponential."
 )
 REASONS = {  # why a target is missed, by how its name starts
     "scanline, forward": MILLISECONDS,
@@ -60,7 +62,8 @@ REASONS = {  # why a target is missed, by how its name starts
     "busy machine moves this ratio, too.",
     "memory, last training step": "Most of it comes before step 500; a leak would grow evenly. "
     "The cause was not found.",
-    "peak memory, bands": "Every band keeps its lists, and sums of its own of the gradient of its pose.",
+    "peak memory, bands": "Every band keeps its splats and their moments for the way back: 170 000 of them where a "
+    "band is a row, 13 000 in one whole image. Projecting them again instead would cost four fifths of a render.",
     "torch twin": "A busy machine moves it.",
 }
 

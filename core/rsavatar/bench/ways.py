@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -114,6 +115,17 @@ class Exposure:
         image = self._render(self.scene)
         upstream = [g.to(image.rgb.dtype) for g in self._upstream]
         return torch.autograd.grad([image.rgb, image.transmittance], self._leaves, upstream)
+
+    @cached_property
+    def _seen(self) -> tuple[Tensor, Tensor]:
+        """The image itself as bytes [3, H, W], and its mask."""
+        image = self.forward()
+        return (255 * image.rgb.clamp(0, 1)).byte(), (255 * (1 - image.transmittance)).byte()
+
+    def one_pass(self) -> tuple[Tensor, ...]:
+        """The gradients of an L1 loss, as training takes them: strips are drawn, compared and walked back at once."""
+        loss = native.render_l1(self.scene, *self._seen, background=0.0, mask_weight=0.1).loss
+        return torch.autograd.grad(loss, self._leaves)
 
     def motion_gradient(self) -> Tensor:
         """Gradient [1, P, 25, 3] of the motion's control points, float64."""
