@@ -77,18 +77,26 @@ Results run(RsFrame *frame, const RsGaussians &g, const Array &pose, const Shutt
     if (rs_render(frame, &g, pose.data(), T, D, shutter.rows.data(), &camera, &options, r.rgb.data(), r.transmittance.data(), &counters))
         return r;
     Array target_gradient = r.rgb, gradient_t = r.transmittance;
-    std::vector<uint8_t> target(3 * HW, 90), mask(HW, 255);
-    rs_l1(r.rgb.data(), r.transmittance.data(), target.data(), mask.data(), camera.height, camera.width, .5f, .1f, threads,
-          target_gradient.data(), gradient_t.data());
+    const std::vector<uint8_t> bytes(3 * HW, 90), mask(HW, 255);
+    const RsTarget target = {bytes.data(), mask.data(), .5f, .1f};
+    rs_l1(r.rgb.data(), r.transmittance.data(), &target, camera.height, camera.width, threads, target_gradient.data(), gradient_t.data());
     const size_t sizes[] = {3 * M, 4 * M, 3 * M, M, 3 * M * g.bases, JOINTS * M, 2 * M, T * D * JOINTS * 12};
     size_t total = 0;
     for (size_t n : sizes) total += n;
-    r.gradients.resize(total);
-    float *p[8], *at = r.gradients.data();
-    for (int i = 0; i < 8; i++) p[i] = at, at += sizes[i];
-    RsGradients all = {p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7]}, none = {};
+    r.gradients.resize(2 * total + 2);
+    auto gradients_at = [&](float *at) {
+        float *p[8];
+        for (int i = 0; i < 8; i++) p[i] = at, at += sizes[i];
+        return RsGradients{p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7]};
+    };
+    const RsGradients all = gradients_at(r.gradients.data()), fused = gradients_at(r.gradients.data() + total), none = {};
     rs_render_backward(frame, &g, pose.data(), r.rgb.data(), r.transmittance.data(), target_gradient.data(), gradient_t.data(), &none);
     rs_render_backward(frame, &g, pose.data(), r.rgb.data(), r.transmittance.data(), target_gradient.data(), gradient_t.data(), &all);
+
+    double loss, squared_error;
+    rs_render_l1(frame, &g, pose.data(), T, D, shutter.rows.data(), &camera, &options, &target, &counters, &loss, &squared_error);
+    rs_render_l1_backward(frame, &g, pose.data(), 3.f, &fused);
+    r.gradients[2 * total] = loss, r.gradients[2 * total + 1] = squared_error;
     return r;
 }
 
@@ -127,6 +135,15 @@ void kinematics(int states, bool residuals) {
     rs_pose_backward(&body, states, transforms.data(), g.data(), residuals ? gr.data() : nullptr, gR.data(), gT.data(), gJ.data());
 }
 
+bool continuity(int frames, int points) {
+    const Array control = random(frames * points * 75, 0, 3);
+    const std::vector<double> ends(2 * points, .5), meeting(frames, .25);
+    Array one(control.size()), two(control.size());
+    const double a = rs_continuity(control.data(), frames, points, ends.data(), meeting.data(), 1, 1, one.data());
+    const double b = rs_continuity(control.data(), frames, points, ends.data(), meeting.data(), 1, 2, two.data());
+    return a == b && one == two;
+}
+
 }  // namespace
 
 int main() {
@@ -139,6 +156,7 @@ int main() {
         }
     rs_frame_destroy(frame);
     for (int states : {0, 1, 5}) kinematics(states, false), kinematics(states, true);
+    for (int frames : {1, 2, 7}) same &= continuity(frames, 4);
     printf("kernels of %d lanes: %s\n", rs_lanes(), same ? "same bits for 1, 2 and 5 threads" : "results depend on the threads");
     return !same;
 }

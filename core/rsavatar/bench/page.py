@@ -49,8 +49,8 @@ MILLISECONDS = (
     "Milliseconds are of the processor above under the load above; the ratios are what carries over. The target was "
     "set with prototypes on a processor of 16 lanes; their plain build of 8 lanes takes 34 ms on one thread of an AMD "
     "EPYC with AVX2, on a scene of its own with fewer pixels. What each part of these kernels gives there, and what "
-    "was tried beyond: docs/decisions/0017. What is left is two thirds rasteriser: 435 000 vectors of 8 pixels forward, as "
-    "many backward, each with an exponential."
+    "was tried beyond: docs/decisions/0017 and 0018. What is left is two thirds rasteriser: 435 000 vectors of 8 "
+    "pixels forward, as many backward, each with an exponential."
 )
 REASONS = {  # why a target is missed, by how its name starts
     "scanline, forward": MILLISECONDS,
