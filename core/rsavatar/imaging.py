@@ -73,8 +73,7 @@ def polynomials(transforms: Tensor, coefficients: int) -> Tensor:
     if coefficients == 1:
         return values
     inverse = _nodes(coefficients)[1].to(transforms)
-    result: Tensor = torch.einsum("dn,tnjrc->tdjrc", inverse, values)
-    return result
+    return (inverse @ values.flatten(2)).unflatten(2, values.shape[2:])
 
 
 class Actor(torch.nn.Module):

@@ -82,8 +82,8 @@ class AbstractMotion(torch.nn.Module, ABC):
 
 def split(values: Tensor) -> BodyState:
     """A state from its stacked channels [..., 25, 3]."""
-    root = torch.zeros_like(values[..., :1, :])
-    return BodyState(torch.cat([root, values[..., 1:JOINTS, :]], -2), values[..., 0, :], values[..., JOINTS, :])
+    rotations = torch.nn.functional.pad(values[..., 1:JOINTS, :], (0, 0, 1, 0))
+    return BodyState(rotations, values[..., 0, :], values[..., JOINTS, :])
 
 
 def unwrap(rotvecs: Array) -> Array:

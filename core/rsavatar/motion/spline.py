@@ -66,7 +66,8 @@ class FrameSpline(AbstractMotion):
     def state(self, frame: int, offsets: Tensor) -> BodyState:
         """States [D] of frame ``frame`` at ``offsets`` [D] source frames from its mid time: one product for all."""
         weights = self._weights(0.5 + offsets / self.period)
-        return split(torch.einsum("dp,pjc->djc", weights, self.control[frame]))
+        points = self.control[frame]
+        return split((weights @ points.flatten(1)).unflatten(1, points.shape[1:]))
 
     def at(self, times: Tensor) -> BodyState:
         """States at absolute ``times`` [...], source frames, by the trajectory of the nearest frame."""
