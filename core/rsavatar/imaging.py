@@ -73,7 +73,8 @@ def polynomials(transforms: Tensor, coefficients: int) -> Tensor:
     if coefficients == 1:
         return values
     inverse = _nodes(coefficients)[1].to(transforms)
-    return (inverse @ values.flatten(2)).unflatten(2, values.shape[2:])
+    result: Tensor = inverse @ values.flatten(2)
+    return result.reshape(values.shape)
 
 
 class Actor(torch.nn.Module):

@@ -67,7 +67,7 @@ class FrameSpline(AbstractMotion):
         """States [D] of frame ``frame`` at ``offsets`` [D] source frames from its mid time: one product for all."""
         weights = self._weights(0.5 + offsets / self.period)
         points = self.control[frame]
-        return split((weights @ points.flatten(1)).unflatten(1, points.shape[1:]))
+        return split((weights @ points.flatten(1)).reshape(-1, *points.shape[1:]))
 
     def at(self, times: Tensor) -> BodyState:
         """States at absolute ``times`` [...], source frames, by the trajectory of the nearest frame."""
