@@ -64,7 +64,7 @@ REASONS = {  # why a target is missed, by how its name starts
     "The cause was not found.",
     "peak memory, bands": "Every band keeps its splats and their moments for the way back: 170 000 of them where a "
     "band is a row, 13 000 in one whole image. Projecting them again instead would cost four fifths of a render.",
-    "torch twin": "A busy machine moves it.",
+    "torch twin": "Other tenants of the machine move both, and not together: 400 to 580 in runs of this bench.",
 }
 
 
@@ -116,13 +116,13 @@ def _growth(result: GrowthResult, folder: Path) -> list[str]:
 
 
 def _missed(targets: Sequence[Target]) -> list[str]:
-    """A sentence on every target that was not met and whose reason is known."""
-    lines = [
-        f"- {target.name}: {reason}"
-        for target in targets
-        for start, reason in REASONS.items()
-        if not target.met and target.name.startswith(start)
-    ]
+    """Why targets were not met, as far as it is known: a reason once, after all that it speaks of."""
+    names: dict[str, list[str]] = {}
+    for target in targets:
+        for start, reason in REASONS.items():
+            if not target.met and target.name.startswith(start):
+                names.setdefault(reason, []).append(target.name)
+    lines = [f"- {'; '.join(missed)}: {reason}" for reason, missed in names.items()]
     return ["Not met:\n", *lines, ""] if lines else []
 
 
