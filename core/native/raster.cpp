@@ -27,6 +27,8 @@ struct Canvas {
 enum { T_PLANE, R_PLANE, G_PLANE, B_PLANE, FORWARD_PLANES };                    // forward
 enum { REST_PLANE = 1, GR_PLANE, GG_PLANE, GB_PLANE, BACKWARD_PLANES };         // backward: T, rest, dL/dR, dL/dG, dL/dB
 
+static thread_local std::vector<float> forward_buffer, backward_buffer, strip_buffer;  // kept from task to task
+
 static Canvas open_canvas(const RsFrame &frame, const Slot &slot, int strip, int planes, std::vector<float> &buffer) {
     Canvas c;
     const Rows rows = rows_of(frame, slot, strip);
@@ -113,27 +115,25 @@ static void blend_strip(const RsFrame &frame, const Slot &slot, int strip, const
 // weight * canvas, on the image's columns: the first slot of a group sets them, the others add.
 static void emit(const Canvas &c, float weight, bool first, const Planes<float> &image) {
     auto put = [first](float *out, float value) { *out = first ? value : *out + value; };
-    const int left = c.x0 < c.x1 ? c.x0 : image.x1, n = c.x1 - c.x0, width = image.x1 - image.x0;
+    const int n = c.x1 - c.x0, before = (n ? c.x0 : image.x1) - image.x0, width = image.x1 - image.x0;
     for (int y = c.r0; y < c.r1; y++) {
         const size_t start = image.at(y, image.x0);
         float *out[4] = {image.transmittance + start, image.rgb + start, image.rgb + image.plane + start, image.rgb + 2 * image.plane + start};
         for (int p = 0; p < 4; p++) {
             const float *in = c.at(y, c.x0) + p * c.plane, outside = p ? 0.f : weight;
-            const int before = left - image.x0;
             for (int x = 0; x < before; x++) put(out[p] + x, outside);
-            if (p) for (int x = 0; x < n; x++) put(out[p] + before + x, weight * in[x]);
-            else for (int x = 0; x < n; x++) put(out[p] + before + x, weight * std::fabs(in[x]));
+            for (int x = 0; x < n; x++) put(out[p] + before + x, weight * (p ? in[x] : std::fabs(in[x])));
             for (int x = before + n; x < width; x++) put(out[p] + x, outside);
         }
     }
 }
 
-static void draw(RsFrame &frame, Task task, std::vector<float> &buffer, const Planes<float> &image) {
+static void draw(RsFrame &frame, Task task, const Planes<float> &image) {
     const Group &group = frame.groups[task.group];
     for (int k = 0; k < group.slots; k++) {
         Slot &slot = frame.slots[group.first_slot + k];
         order(frame, slot, task.strip);
-        Canvas c = open_canvas(frame, slot, task.strip, FORWARD_PLANES, buffer);
+        Canvas c = open_canvas(frame, slot, task.strip, FORWARD_PLANES, forward_buffer);
         blend_strip(frame, slot, task.strip, c);
         emit(c, slot.rows.weight, k == 0, image);
     }
@@ -196,16 +196,16 @@ template <int N> struct Moments {
     }
 };
 
-static void walk_back(RsFrame &frame, Task task, const Limits &limits, std::vector<float> &forward, std::vector<float> &backward,
-                      const Planes<const float> &image, const Planes<const float> &gradient) {
+static void walk_back(RsFrame &frame, Task task, const Planes<const float> &image, const Planes<const float> &gradient) {
+    const Limits limits(frame.options);
     const Group &group = frame.groups[task.group];
     const int strip = task.strip;
     for (int k = 0; k < group.slots; k++) {
         Slot &slot = frame.slots[group.first_slot + k];
-        Canvas own, c = open_canvas(frame, slot, strip, BACKWARD_PLANES, backward);
+        Canvas own, c = open_canvas(frame, slot, strip, BACKWARD_PLANES, backward_buffer);
         bool averaged = group.slots > 1 || slot.rows.weight != 1.f;
         if (averaged) {  // the slot's own image is not stored: blend it again
-            own = open_canvas(frame, slot, strip, FORWARD_PLANES, forward);
+            own = open_canvas(frame, slot, strip, FORWARD_PLANES, forward_buffer);
             blend_strip(frame, slot, strip, own);
         }
         open_gradient(slot, c, averaged ? &own : nullptr, image, gradient);
@@ -227,24 +227,25 @@ template <class Work> static void each_task(const RsFrame &frame, Work work) {
     attempt.settle();
 }
 
-static thread_local std::vector<float> forward_buffer, backward_buffer, strip_buffer;
-
 static void make_room_for_moments(RsFrame &frame) {
     for (int t = 0; t < frame.slot_count; t++) frame.slots[t].moments.resize(frame.slots[t].entries.size() * 16);
 }
 
 void raster(RsFrame &frame, const Planes<float> &image) {
-    each_task(frame, [&](Task task) { draw(frame, task, forward_buffer, image); });
+    each_task(frame, [&](Task task) { draw(frame, task, image); });
 }
 
 void raster_backward(RsFrame &frame, const Planes<const float> &image, const Planes<const float> &gradient) {
     make_room_for_moments(frame);
-    const Limits limits(frame.options);
-    each_task(frame, [&](Task task) { walk_back(frame, task, limits, forward_buffer, backward_buffer, image, gradient); });
+    each_task(frame, [&](Task task) { walk_back(frame, task, image, gradient); });
 }
 
-// Planes for the columns that a task's splats reach.
-static Planes<float> open_strip(const RsFrame &frame, Task task, Rows rows, int image) {
+struct Strip {
+    Planes<float> image, gradient;
+};
+
+// Room for the columns that a task's splats reach.
+static Strip open_strip(const RsFrame &frame, Task task, Rows rows) {
     const Group &group = frame.groups[task.group];
     int x0 = MAX_SIZE, x1 = 0;
     for (int k = 0; k < group.slots; k++) {
@@ -253,19 +254,18 @@ static Planes<float> open_strip(const RsFrame &frame, Task task, Rows rows, int 
     }
     if (x0 >= x1) x0 = x1 = 0;
     const size_t plane = (size_t)(rows.hi - rows.lo) * (x1 - x0);
-    strip_buffer.resize(2 * 4 * plane);
-    float *p = strip_buffer.data() + image * 4 * plane;
-    return {p, p + 3 * plane, plane, x0, x1, rows.lo};
+    strip_buffer.resize(8 * plane);
+    float *image = strip_buffer.data(), *gradient = image + 4 * plane;
+    return {{image, image + 3 * plane, plane, x0, x1, rows.lo}, {gradient, gradient + 3 * plane, plane, x0, x1, rows.lo}};
 }
 
 void raster_compared(RsFrame &frame, Comparison &comparison) {
     make_room_for_moments(frame);
-    const Limits limits(frame.options);
     each_task(frame, [&](Task task) {
         const Rows rows = rows_of(frame, frame.slots[frame.groups[task.group].first_slot], task.strip);
-        const Planes<float> image = open_strip(frame, task, rows, 0), gradient = open_strip(frame, task, rows, 1);
-        draw(frame, task, forward_buffer, image);
-        comparison.rows(rows.lo, rows.hi, image, gradient);
-        walk_back(frame, task, limits, forward_buffer, backward_buffer, image, gradient);
+        const Strip strip = open_strip(frame, task, rows);
+        draw(frame, task, strip.image);
+        comparison.rows(rows.lo, rows.hi, strip.image, strip.gradient);
+        walk_back(frame, task, strip.image, strip.gradient);
     });
 }
