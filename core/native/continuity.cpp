@@ -4,20 +4,12 @@
 #include <vector>
 
 #include "layout.h"
+#include "vector3.h"
 
 namespace {
 
 constexpr int CHANNELS = JOINTS + 1;
 constexpr double TINY = 1e-20;  // added to a squared length before its root: the gradient of a length stays finite at 0
-
-struct V3 {
-    double x, y, z;
-};
-V3 operator+(V3 a, V3 b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-V3 operator-(V3 a, V3 b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-V3 operator*(double s, V3 a) { return {s * a.x, s * a.y, s * a.z}; }
-double dot(V3 a, V3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-V3 cross(V3 a, V3 b) { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; }
 
 struct Gap {
     double length;

@@ -3,24 +3,18 @@
 #include <cmath>
 
 #include "layout.h"
+#include "vector3.h"
 
 namespace {
 
 constexpr double TINY = 1e-8;  // angle under which the exponential's coefficients are taken from their series
 
-struct V3 {
-    double x, y, z;
-};
 struct M3 {
     double m[9];
 };
 
 V3 read(const float *p) { return {p[0], p[1], p[2]}; }
 void add(float *p, const V3 &v) { p[0] += v.x, p[1] += v.y, p[2] += v.z; }
-V3 operator+(V3 a, V3 b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-V3 operator-(V3 a, V3 b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-V3 operator*(double s, V3 a) { return {s * a.x, s * a.y, s * a.z}; }
-V3 cross(V3 a, V3 b) { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; }
 V3 mul(const M3 &a, V3 v) {
     const double *m = a.m;
     return {m[0] * v.x + m[1] * v.y + m[2] * v.z, m[3] * v.x + m[4] * v.y + m[5] * v.z, m[6] * v.x + m[7] * v.y + m[8] * v.z};
@@ -42,7 +36,7 @@ M3 outer(V3 a, V3 b) { return {{a.x * b.x, a.x * b.y, a.x * b.z, a.y * b.x, a.y 
 
 // exp on SO(3): I + a [r] + b [r]^2, a = sin t / t, b = (1 - cos t) / t^2
 M3 exponential(V3 r) {
-    double t2 = r.x * r.x + r.y * r.y + r.z * r.z, t = std::sqrt(t2);
+    double t2 = dot(r, r), t = std::sqrt(t2);
     double a = t < TINY ? 1. : std::sin(t) / t, b = t < TINY ? 0.5 : 2. * std::pow(std::sin(0.5 * t) / t, 2);
     return {{1. - b * (r.y * r.y + r.z * r.z), b * r.x * r.y - a * r.z, b * r.x * r.z + a * r.y,
              b * r.x * r.y + a * r.z, 1. - b * (r.x * r.x + r.z * r.z), b * r.y * r.z - a * r.x,
@@ -53,7 +47,7 @@ M3 exponential(V3 r) {
 V3 exponential_backward(V3 r, const M3 &E, const M3 &gE) {
     const M3 m = gE * transposed(E);
     const V3 v = {m.m[7] - m.m[5], m.m[2] - m.m[6], m.m[3] - m.m[1]};
-    double t2 = r.x * r.x + r.y * r.y + r.z * r.z, t = std::sqrt(t2);
+    double t2 = dot(r, r), t = std::sqrt(t2);
     double b = t < TINY ? 0.5 : 2. * std::pow(std::sin(0.5 * t) / t, 2);
     double c = t < 1e-3 ? 1. / 6. - t2 / 120. : (t - std::sin(t)) / (t2 * t);
     const V3 rv = cross(r, v);
