@@ -16,7 +16,7 @@ struct alignas(64) Splat {
     float r, g, b;
     int16_t x_lo, x_hi, y_lo, y_hi;    // where alpha >= alpha_min can hold, clipped to the slot and the image
     float depth, depth_rate, tau;      // depth at its own tau, and its derivative in tau
-    int32_t fate;
+    int32_t fate;                      // see Fate
 };
 static_assert(sizeof(Splat) == 64, "one cache line");
 
