@@ -27,15 +27,15 @@ static void sort_by_depth(Sorting &s) {
     }
 }
 
-static void keep_survivors(Slot &slot, const std::vector<Splat> &projected, Sorting &sorting) {
+static void keep_survivors(Slot &slot, const std::vector<int32_t> &blocks, const std::vector<Splat> &projected, Sorting &sorting) {
     int n = 0;
-    slot.broken = 0;
-    for (const Splat &s : projected) n += s.fate == SURVIVES, slot.broken += s.fate == BROKEN;
+    slot.projected = 0, slot.broken = 0;
+    for (const Splat &s : projected) n += s.fate == SURVIVES, slot.broken += s.fate == BROKEN, slot.projected += s.fate != ABSENT;
     slot.ids.resize(n), slot.splats.resize(n), sorting.keys.resize(n), sorting.order.resize(n);
     for (int i = 0, k = 0; k < n; i++) {
         const Splat &s = projected[i];
         if (s.fate != SURVIVES) continue;
-        slot.ids[k] = i, slot.splats[k] = s, sorting.order[k] = k;
+        slot.ids[k] = blocks[i / LANES] + i % LANES, slot.splats[k] = s, sorting.order[k] = k;
         memcpy(&sorting.keys[k++], &s.depth, sizeof s.depth);
     }
 }
@@ -63,10 +63,9 @@ static void share_out(const RsFrame &frame, Slot &slot, std::vector<int32_t> &fi
     for (int strip = 0; strip < slot.strips; strip++) slot.strip_begin[strip + 1] += slot.strip_begin[strip];
 }
 
-void bin(RsFrame &frame, int index, const std::vector<Splat> &projected) {
+void bin(RsFrame &frame, Slot &slot, const std::vector<int32_t> &blocks, const std::vector<Splat> &projected) {
     static thread_local Sorting sorting;
-    Slot &slot = frame.slots[index];
-    keep_survivors(slot, projected, sorting);
+    keep_survivors(slot, blocks, projected, sorting);
     sort_by_depth(sorting);
     share_out(frame, slot, sorting.first_strip);
     slot.entries.resize(slot.first_pair.back());

@@ -34,12 +34,13 @@ struct Rows {
 // coordinates x = dx + tilt dy and y = dy.
 enum Moment { M0, MX, MY, MXX, MXY, MYY, MR, MG, MB, MOMENTS };
 
-enum Fate { SURVIVES = 0, UNSEEN = -1, BROKEN = -2 };  // broken: a number of the Gaussian's, or of its pose's, is not finite
+// Broken: a number of the Gaussian's, or of its pose's, is not finite. Absent: there is no such Gaussian.
+enum Fate { SURVIVES = 0, UNSEEN = -1, BROKEN = -2, ABSENT = -3 };
 
 struct Slot {
     RsRows rows;
     int strips;
-    int broken;                        // Gaussians whose fate that was
+    int projected, broken;             // Gaussians; the latter of that fate
     std::vector<int32_t> ids;          // surviving Gaussians, ascending
     std::vector<Splat> splats;         // theirs
     std::vector<int32_t> first_pair;   // splat -> its first pair; a splat's pairs are its strips, from the top; [n + 1]
@@ -57,16 +58,32 @@ struct Task {  // what one thread rasterises at a time
     int group, strip;
 };
 
+// What LANES consecutive Gaussians keep to, in canonical space; see cull.cpp.
+struct Ball {
+    float centre[3], radius;  // of their means, metres
+    float size;               // their longest axis, metres
+    float shift;              // of their rows by `screen`, pixels
+    uint32_t joints;          // a bit for each that one of them is bound to
+    bool bounded;             // whether all this holds
+};
+
 struct RsFrame {
     RsCamera camera;
     RsOptions options;
     int coefficients;
-    int slot_count = 0;
+    std::vector<RsRows> rows;          // of every slot
+    std::vector<int> waves;            // wave -> its first slot; [waves + 1]. One wave is planned at a time
+    RsTarget target;                   // of a comparison that several waves repeat on the way back
+    std::vector<Ball> balls;           // block of LANES Gaussians -> what bounds it; none where nothing is culled
+    int first_slot = 0, slot_count = 0;  // the wave's
     std::vector<Slot> slots;           // capacity is kept between images: slots[0, slot_count) are in use
     std::vector<Group> groups;
     std::vector<Task> tasks;
-    std::vector<Splat> projected;      // every Gaussian in the only slot; of several slots, each thread has its own
-    std::vector<float> pose_sums;      // [chunks][slots at a time][D * 24 * 12]
+    std::vector<int32_t> blocks;       // of the only slot: first Gaussian of each block that is projected,
+    std::vector<Splat> projected;      // and LANES splats for each; of several slots, each thread has its own
+    std::vector<float> pose_sums;      // [chunks][slots of the wave][D * 24 * 12]
+
+    bool in_waves() const { return waves.size() > 2; }
 };
 
 static inline Rows rows_of(const RsFrame &frame, const Slot &slot, int strip) {
@@ -74,12 +91,14 @@ static inline Rows rows_of(const RsFrame &frame, const Slot &slot, int strip) {
     return {lo, lo + frame.options.strip_rows < slot.rows.hi ? lo + frame.options.strip_rows : slot.rows.hi};
 }
 
-void project(const RsFrame &frame, const RsGaussians &gaussians, const float *pose, int slot, int begin, int end, Splat *projected);
-void bin(RsFrame &frame, int slot, const std::vector<Splat> &projected);
+void surround(RsFrame &frame, const RsGaussians &gaussians);
+void cull(const RsFrame &frame, const RsGaussians &gaussians, const float *pose, const Slot &slot, std::vector<int32_t> &blocks);
+void project(const RsFrame &frame, const RsGaussians &gaussians, const float *pose, const Slot &slot, const int32_t *blocks, int count, Splat *projected);
+void bin(RsFrame &frame, Slot &slot, const std::vector<int32_t> &blocks, const std::vector<Splat> &projected);
 void order(const RsFrame &frame, Slot &slot, int strip);
 void raster(RsFrame &frame, const Planes<float> &image);
 void raster_backward(RsFrame &frame, const Planes<const float> &image, const Planes<const float> &gradient);
-void raster_compared(RsFrame &frame, Comparison &comparison);  // both, through the loss; keeps no image
+void raster_compared(RsFrame &frame, Comparison &comparison, bool walks_back);  // both, through the loss; keeps no image
 void project_backward(RsFrame &frame, const RsGaussians &gaussians, const float *pose, float scale, const RsGradients &gradients);
 
 // Runs work within a parallel region, which no exception may leave: that memory ran out is noted, and thrown after it.

@@ -121,9 +121,12 @@ static inline void pose_at(const Blend &blend, int D, Floats tau, const Vec3 &x,
     o.vd = (o.velocity.y - o.yz * o.velocity.z) * o.iz * cam.fy;
 }
 
-// 1 - rate * dv/dtau, kept away from 0: a body that moves at scan speed is smeared, not infinite.
-static inline Floats scan_slack(float rate, Floats vd) {
-    const float least = 1e-2f;
+// 1 - rate * dv/dtau: 0 at scan speed, where a point moves along with the row that is read. Its own time and its shear are first-order
+// terms over this slack, which hold no longer where it is small, so it is held at this size: a tenth keeps one such Gaussian from
+// outweighing all others in a gradient (docs/decisions/0019).
+constexpr float LEAST_SLACK = 0.1f;
+
+static inline Floats scan_slack(float rate, Floats vd, float least = LEAST_SLACK) {
     Floats s = 1.f - vd * rate;
     return select((s < least) & (s > -least), select(s < 0.f, splat(-least), splat(least)), s);
 }

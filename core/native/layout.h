@@ -50,8 +50,8 @@ struct RsCamera {
     int32_t height, width;
 };
 
-// Bits of RsOptions.flags: corrections of own time that are left out, to measure what each is worth.
-enum RsFlag { RS_NO_SHEAR = 1, RS_NO_IMPLICIT = 2, RS_NO_RESORT = 4 };
+// Bits of RsOptions.flags: corrections of own time, and the culling of blocks, that are left out, to measure what each is worth.
+enum RsFlag { RS_NO_SHEAR = 1, RS_NO_IMPLICIT = 2, RS_NO_RESORT = 4, RS_NO_CULL = 8 };
 
 struct RsOptions {
     float near, dilation, alpha_min, alpha_max, transmittance_min;
@@ -60,9 +60,10 @@ struct RsOptions {
 
 // What the plan of a frame came to; see RsFrame.
 struct RsCounters {
-    int64_t splats;  // Gaussians that survived culling, summed over slots
-    int64_t pairs;   // (splat, strip) pairs rasterised
-    int64_t broken;  // Gaussians not drawn because NaN or infinity is in them or in their pose, summed over slots
+    int64_t projected;  // Gaussians in blocks that might reach a slot, summed over slots
+    int64_t splats;     // those that survived, summed over slots
+    int64_t pairs;      // (splat, strip) pairs rasterised
+    int64_t broken;     // Gaussians not drawn because NaN or infinity is in them or in their pose, summed over slots
 };
 
 struct RsFrame;  // one image's plan and scratch, kept between forward and backward and reused between images
@@ -97,7 +98,8 @@ RS_API int rs_render_l1(RsFrame *frame, const RsGaussians *gaussians, const floa
                         const RsCamera *camera, const RsOptions *options, const RsTarget *target, RsCounters *counters, double *loss,
                         double *squared_error);
 
-// Gradients of `scale` times the loss that `frame` computed last, with the same arguments. Can be called once.
+// Gradients of `scale` times the loss that `frame` computed last, with the same arguments; target's images are still there. Can be
+// called once.
 RS_API int rs_render_l1_backward(RsFrame *frame, const RsGaussians *gaussians, const float *pose, float scale, const RsGradients *gradients);
 
 // Joint angles of B states of one body. Rotations are axis-angle, radians; lengths in metres.

@@ -21,7 +21,7 @@ static Floats own_time(const Blend &blend, int D, const Vec3 &x, const RsRows &r
         for (int d = D - 2; d >= 0; d--) Yd = Yd * tau + Y, Zd = Zd * tau + Z, Y = Y * tau + y[d], Z = Z * tau + z[d];
         Floats iz = 1.f / select(Z >= near, Z, splat(near));
         Floats v = Y * iz * cam.fy + cam.cy, vd = (Yd - Y * iz * Zd) * iz * cam.fy;
-        tau = clamp(tau - (tau - (v * rows.rate + rows.start)) / scan_slack(rows.rate, vd), -1.f, 1.f);
+        tau = clamp(tau - (tau - (v * rows.rate + rows.start)) / scan_slack(rows.rate, vd, 1e-2f), -1.f, 1.f);
     }
     return tau;
 }
@@ -85,20 +85,18 @@ static void project_block(const RsFrame &frame, const RsGaussians &g, const floa
     const Ints sound = finite(block, g, p, f, s);
     const Floats x_lo = first_centre(u - half_x, 0.f, width), x_hi = first_centre(u + half_x, 0.f, width);
     const Floats y_lo = first_centre(v - half_y, top, bottom), y_hi = first_centre(v + half_y, top, bottom);
-    for (int i = 0; i < LANES && first + i < g.count; i++) {
-        Splat &out = projected[first + i];
+    for (int i = 0; i < LANES; i++) {
+        Splat &out = projected[i];
         out.u = u[i], out.v = v[i], out.qxx = qxx[i], out.tilt = tilt[i], out.qyy = qyy[i], out.log2_opacity = log2_opacity[i];
         out.r = std::max(s.colour[0][i], 0.f), out.g = std::max(s.colour[1][i], 0.f), out.b = std::max(s.colour[2][i], 0.f);
         out.x_lo = x_lo[i], out.x_hi = x_hi[i], out.y_lo = y_lo[i], out.y_hi = y_hi[i];
         out.depth = p.camera.z[i], out.depth_rate = p.velocity.z[i], out.tau = tau[i];
-        out.fate = !sound[i] ? BROKEN : seen[i] ? SURVIVES : UNSEEN;
+        out.fate = first + i >= g.count ? ABSENT : !sound[i] ? BROKEN : seen[i] ? SURVIVES : UNSEEN;
     }
 }
 
-void project(const RsFrame &frame, const RsGaussians &g, const float *pose, int index, int begin, int end, Splat *projected) {
-    const Slot &slot = frame.slots[index];
-    const float *slot_pose = pose + (size_t)index * frame.coefficients * JOINTS * 12;
-    for (int first = begin; first < end; first += LANES) project_block(frame, g, slot_pose, first, slot, projected);
+void project(const RsFrame &frame, const RsGaussians &g, const float *pose, const Slot &slot, const int32_t *blocks, int count, Splat *projected) {
+    for (int k = 0; k < count; k++) project_block(frame, g, pose, blocks[k], slot, projected + (size_t)k * LANES);
 }
 
 // ---- backward ---------------------------------------------------------------------------------------------------------
@@ -146,7 +144,8 @@ struct PosedGradient {
 static PosedGradient through_projection(SplatGradient s, const Posed &p, const Footprint &f, const RsCamera &cam, float rate) {
     // tilt = -(slack r + a), S = slack^2 / syy, a = rate ud, slack = 1 - rate vd
     Floats slack = scan_slack(rate, p.vd), gr = -slack * s.tilt, gS = slack * slack * s.S;
-    Floats gud = s.tilt * -rate, gvd = (f.r * s.tilt - 2.f * slack * f.inverse_syy * s.S) * rate;
+    const Ints free = (slack > LEAST_SLACK) | (slack < -LEAST_SLACK);
+    Floats gud = s.tilt * -rate, gvd = keep(free, (f.r * s.tilt - 2.f * slack * f.inverse_syy * s.S) * rate);
     // dr = (dsxy - r dsyy) / syy, d(1/A) = dsxx - 2 r dsxy + r^2 dsyy, gathered around e = k0 - r k1, which is small on needles
     Vec3 e = f.k0 - f.k1 * f.r;
     Floats of_e = -2.f * f.A * f.A * s.A, of_r = gr * f.inverse_syy;
@@ -320,18 +319,17 @@ static void clear(const RsGradients &out, const RsGaussians &g, int begin, int e
 // Chunks of Gaussian ids, as many for one thread as for sixty: each chunk walks the slots in order and owns its rows of
 // every gradient; the pose sums of the chunks are added in order. So the result does not depend on the threads.
 constexpr int CHUNKS = 16;
-constexpr int SLOTS_AT_A_TIME = 32;  // what bounds the memory of the sums
 
-static void slots_backward(RsFrame &frame, const RsGaussians &g, const float *pose, float scale, const RsGradients &out, int from, int to) {
-    const size_t n = (size_t)frame.coefficients * JOINTS * 12, slots = to - from;
+void project_backward(RsFrame &frame, const RsGaussians &g, const float *pose, float scale, const RsGradients &out) {
+    const size_t n = (size_t)frame.coefficients * JOINTS * 12, slots = frame.slot_count, before = frame.first_slot * n;
     frame.pose_sums.assign(out.pose ? CHUNKS * slots * n : 0, 0.f);
     Attempt attempt;
 #pragma omp parallel for schedule(dynamic, 1) num_threads(frame.options.threads)
     for (int chunk = 0; chunk < CHUNKS; chunk++) attempt([&, chunk] {
         int32_t begin = (int64_t)g.count * chunk / CHUNKS, end = (int64_t)g.count * (chunk + 1) / CHUNKS;
-        if (from == 0) clear(out, g, begin, end);
+        if (frame.first_slot == 0) clear(out, g, begin, end);
         std::vector<Floats> sums(n);
-        for (int t = from; t < to; t++) {
+        for (size_t t = 0; t < slots; t++) {
             const Slot &slot = frame.slots[t];
             int first = std::lower_bound(slot.ids.begin(), slot.ids.end(), begin) - slot.ids.begin();
             int last = std::lower_bound(slot.ids.begin() + first, slot.ids.end(), end) - slot.ids.begin();
@@ -339,11 +337,11 @@ static void slots_backward(RsFrame &frame, const RsGaussians &g, const float *po
             std::fill(sums.begin(), sums.end(), Floats{});
             for (int k = first; k < last;) {
                 const Block block(slot.ids.data(), k, last, end);
-                backward_block(frame, g, out, pose + t * n, slot, block, scale, sums.data());
+                backward_block(frame, g, out, pose + before + t * n, slot, block, scale, sums.data());
                 k += block.used;
             }
             if (out.pose)
-                for (size_t i = 0; i < n; i++) frame.pose_sums[(chunk * slots + t - from) * n + i] = sum(sums[i]);
+                for (size_t i = 0; i < n; i++) frame.pose_sums[(chunk * slots + t) * n + i] = sum(sums[i]);
         }
     });
     attempt.settle();
@@ -351,11 +349,6 @@ static void slots_backward(RsFrame &frame, const RsGaussians &g, const float *po
         for (size_t i = 0; i < slots * n; i++) {
             float s = 0.f;
             for (int chunk = 0; chunk < CHUNKS; chunk++) s += frame.pose_sums[chunk * slots * n + i];
-            out.pose[from * n + i] = s;
+            out.pose[before + i] = s;
         }
-}
-
-void project_backward(RsFrame &frame, const RsGaussians &g, const float *pose, float scale, const RsGradients &out) {
-    for (int from = 0; from < frame.slot_count; from += SLOTS_AT_A_TIME)
-        slots_backward(frame, g, pose, scale, out, from, std::min(from + SLOTS_AT_A_TIME, frame.slot_count));
 }

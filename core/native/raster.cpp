@@ -128,11 +128,16 @@ static void emit(const Canvas &c, float weight, bool first, const Planes<float> 
     }
 }
 
+static void order(RsFrame &frame, Task task) {
+    const Group &group = frame.groups[task.group];
+    for (int k = 0; k < group.slots; k++) order(frame, frame.slots[group.first_slot + k], task.strip);
+}
+
 static void draw(RsFrame &frame, Task task, const Planes<float> &image) {
+    order(frame, task);
     const Group &group = frame.groups[task.group];
     for (int k = 0; k < group.slots; k++) {
-        Slot &slot = frame.slots[group.first_slot + k];
-        order(frame, slot, task.strip);
+        const Slot &slot = frame.slots[group.first_slot + k];
         Canvas c = open_canvas(frame, slot, task.strip, FORWARD_PLANES, forward_buffer);
         blend_strip(frame, slot, task.strip, c);
         emit(c, slot.rows.weight, k == 0, image);
@@ -237,7 +242,10 @@ void raster(RsFrame &frame, const Planes<float> &image) {
 
 void raster_backward(RsFrame &frame, const Planes<const float> &image, const Planes<const float> &gradient) {
     make_room_for_moments(frame);
-    each_task(frame, [&](Task task) { walk_back(frame, task, image, gradient); });
+    each_task(frame, [&](Task task) {
+        if (frame.in_waves()) order(frame, task);  // planned anew since it was drawn
+        walk_back(frame, task, image, gradient);
+    });
 }
 
 struct Strip {
@@ -259,13 +267,13 @@ static Strip open_strip(const RsFrame &frame, Task task, Rows rows) {
     return {{image, image + 3 * plane, plane, x0, x1, rows.lo}, {gradient, gradient + 3 * plane, plane, x0, x1, rows.lo}};
 }
 
-void raster_compared(RsFrame &frame, Comparison &comparison) {
-    make_room_for_moments(frame);
+void raster_compared(RsFrame &frame, Comparison &comparison, bool walks_back) {
+    if (walks_back) make_room_for_moments(frame);
     each_task(frame, [&](Task task) {
         const Rows rows = rows_of(frame, frame.slots[frame.groups[task.group].first_slot], task.strip);
         const Strip strip = open_strip(frame, task, rows);
         draw(frame, task, strip.image);
         comparison.rows(rows.lo, rows.hi, strip.image, strip.gradient);
-        walk_back(frame, task, strip.image, strip.gradient);
+        if (walks_back) walk_back(frame, task, strip.image, strip.gradient);
     });
 }

@@ -76,7 +76,7 @@ def compare(image: Rendering, target: Tensor, mask: Tensor, background: float, m
     loss = l1(image, target, mask, background, mask_weight)
     with torch.no_grad():
         error = image.over(background) - target / 255 - background * (1 - mask / 255)
-    return Comparison(loss, float(error.square().mean()), image.splats, image.pairs, image.broken)
+    return Comparison(loss, float(error.square().mean()), image.projected, image.splats, image.pairs, image.broken)
 
 
 WINDOW, DEVIATION = 11, 1.5  # pixels: GauHuman's, and Wang et al.'s

@@ -9,7 +9,8 @@
 | settled | every second visit to an image whose loss no longer changes | training; off unless asked for |
 
 Culled splats, and strips without any, are left out by the kernels always: what they leave out is below the opacity that
-they would draw (``Options.alpha_min``).
+they would draw (``Options.alpha_min``). Of several slots, so are blocks of Gaussians that cannot reach a slot's rows,
+before they are posed: the image keeps its bits (``core/native/cull.cpp``; ``Options.without`` has a switch).
 """
 
 from __future__ import annotations
@@ -118,6 +119,7 @@ class Work:
         one = {
             "pixels": height * width / (full_size[0] * full_size[1]),
             "nodes": float(scene.pose.shape[1]),
+            "projected": image.projected / (slots * max(scene.gaussians.count, 1)),
             "splats": image.splats / (slots * max(scene.gaussians.count, 1)),
             "pairs": float(image.pairs),
             "harmonics": float(scene.gaussians.sh.shape[0]),
@@ -127,8 +129,8 @@ class Work:
 
     def means(self, resting: int) -> dict[str, float]:
         """Per step since the last call: share of the frame's ``pixels`` that are drawn, pose ``nodes``, share of the
-        Gaussians that survive culling (``splats``), (splat, strip) ``pairs``, colour ``harmonics``; and the number of
-        images that are ``resting``.
+        Gaussians that are ``projected`` and that survive culling (``splats``), (splat, strip) ``pairs``, colour
+        ``harmonics``; and the number of images that are ``resting``.
         """
         found = {name: round(value / self._steps, 4) for name, value in self._sums.items()} if self._steps else {}
         self._sums, self._steps = {}, 0

@@ -72,15 +72,24 @@ def rows_of(kind: str) -> tuple[tuple[TimedRows, ...], int]:
         "scanline": ((TimedRows(0, HEIGHT, full, -1.0),), 4),
         "upward": ((TimedRows(0, HEIGHT, -full, 1.0),), 4),
         "part": ((TimedRows(7, 41, 2.0 / 34, -1.0 - 14.0 / 34),), 3),
+        "rows": (tuple(TimedRows(y, y + 1, r, 0.0, 0.5) for y in range(HEIGHT) for r in (0.0, full)), 3),  # many slots
         "exposed": (tuple(TimedRows(0, HEIGHT, 0.9 * full, -0.9 + s, 0.5) for s in (-0.1, 0.1)), 4),
     }
     return kinds[kind]
 
 
-KINDS = ("global", "instant", "blur", "bands", "scanline", "upward", "part", "exposed")
+KINDS = ("global", "instant", "blur", "bands", "scanline", "upward", "part", "exposed", "rows")
 
 
 def scene(kind: str, count: int = 150, seed: int = 0, bases: int = 4, dtype: torch.dtype = torch.float64) -> Scene:
     rows, coefficients = rows_of(kind)
     transforms = pose(len(rows), coefficients, seed).float().to(dtype)
     return Scene(gaussians(count, seed, bases, dtype), transforms, rows, camera(), Options())
+
+
+def orderly(s: Scene) -> Scene:
+    """The same Gaussians in a pole, in the order of their height, all moving as joint 0: a block keeps to few rows."""
+    order = s.gaussians.means[1].argsort()
+    sorted_ones = {f.name: getattr(s.gaussians, f.name)[..., order].contiguous() for f in fields(Gaussians)}
+    sorted_ones["means"][::2] *= 0.1
+    return replace(s, gaussians=Gaussians(**sorted_ones), pose=s.pose[:, :, :1].expand_as(s.pose).contiguous())

@@ -127,6 +127,37 @@ def test_any_number_of_threads_gives_the_same_bits(kind: str) -> None:
         assert all(torch.equal(grads[name], runs[0][1][name]) for name in grads)
 
 
+@pytest.mark.parametrize("kind", ["bands", "rows"])
+def test_blocks_that_cannot_reach_a_slot_are_left_out_without_a_trace(kind: str) -> None:
+    s = scenes.orderly(scenes.scene(kind, count=400, dtype=torch.float32))
+    image, got = gradients(native.render, s)
+    whole, wanted = gradients(native.render, replace(s, options=Options(without=frozenset({"cull"}))))
+    assert torch.equal(image.rgb, whole.rgb)
+    assert torch.equal(image.transmittance, whole.transmittance)
+    assert all(torch.equal(got[name], wanted[name]) for name in wanted)
+    assert (image.splats, whole.projected) == (whole.splats, 400 * len(s.rows))
+    assert image.projected < 0.9 * whole.projected  # half of the slots of "rows" scan, and are not culled
+
+
+@pytest.mark.parametrize("speed", [0.5, 0.95, 1.05, 2.0], ids="{} of scan speed".format)
+def test_motion_near_scan_speed_equals_the_twin(speed: float) -> None:
+    falling = scenes.orderly(scenes.scene("scanline", count=60))
+    pose = falling.pose.clone()
+    pose[:, 1:, :, :, :] = 0.0
+    pose[:, 1, :, 1, 3] = speed * 2.4 / 74.0 * scenes.HEIGHT / 2  # metres a unit of tau, at the body's distance
+
+    def drawn(render: object, dtype: torch.dtype) -> tuple[Rendering, dict[str, Tensor]]:
+        g = scenes.cast(falling.gaussians, dtype)
+        return gradients(render, replace(falling, gaussians=g, pose=pose.float().to(dtype)))
+
+    truth, expected = drawn(reference.render, torch.float64)
+    image, got = drawn(native.render, torch.float32)
+    assert (image.rgb.double() - truth.rgb).square().mean().sqrt() < 1e-4
+    for name in ("means", "log_scales", "pose"):
+        error = (got[name] - expected[name]).norm() / expected[name].norm()
+        assert error < 1e-3, f"gradient of {name}: relative error {error:.1e}"
+
+
 @pytest.mark.parametrize("kind", ["scanline", "exposed"])
 @pytest.mark.parametrize("speed", [0.05, 2.0], ids=["few swaps", "more swaps than insertion sorts"])
 def test_every_row_has_its_own_depth_order(kind: str, speed: float) -> None:

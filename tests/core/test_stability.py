@@ -19,7 +19,7 @@ from rsavatar.bench.stability_case import FIELDS, against_twin, outcome
 from rsavatar.errors import KernelError
 from rsavatar.geometry.rotations import exp_so3, geodesic_distance, log_so3, rotvec_distance
 from rsavatar.render import native
-from rsavatar.render.base import Gaussians, Scene
+from rsavatar.render.base import Gaussians, Options, Scene
 from tests.core import scenes
 
 pytestmark = pytest.mark.skipif(not kernels.available(), reason="no native kernels were built for this machine")
@@ -80,6 +80,19 @@ def test_threads_do_not_change_a_bit(scene: Scene) -> None:
     one, two = runs
     assert torch.equal(one.image.rgb, two.image.rgb)
     assert all(torch.equal(one.gradients[name], two.gradients[name]) for name in one.gradients)
+
+
+@given(nasty_scenes(st.one_of(Number, Broken)), st.sampled_from(["bands", "rows"]), st.booleans())
+@QUICK
+def test_culling_blocks_does_not_change_a_bit(nasty: Scene, kind: str, ordered: bool) -> None:
+    slots = scenes.scene(kind, count=COUNT, dtype=torch.float32)
+    scene = replace(slots, gaussians=nasty.gaussians, pose=slots.pose + nasty.pose[:1, :1] - slots.pose[:1, :1])
+    scene = scenes.orderly(scene) if ordered else scene
+    culled = outcome(native.render, scene)
+    whole = outcome(native.render, replace(scene, options=Options(without=frozenset({"cull"}))))
+    assert torch.equal(culled.image.rgb, whole.image.rgb)
+    assert (culled.image.splats, culled.image.broken) == (whole.image.splats, whole.image.broken)
+    assert all(torch.equal(culled.gradients[name], whole.gradients[name]) for name in whole.gradients)
 
 
 @given(st.floats(0.1, math.log(1e4)), st.integers(0, 20), st.sampled_from(["global", "scanline"]))

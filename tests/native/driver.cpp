@@ -34,8 +34,9 @@ std::vector<Shutter> shutters(int H) {
                                 {"scanline", 4, {{0, H, rate, -1.f, 1.f}}},
                                 {"upward, exposed", 4, {{0, H, -rate, .9f, .5f}, {0, H, -rate, 1.f, .5f}}},
                                 {"part", 2, {{H / 2, H, rate, -1.f, 1.f}}},
-                                {"rows", 1, {}}};
-    for (int y = 0; y < H; y += 3) all.back().rows.push_back({y, y + 1, 0.f, 0.f, 1.f});
+                                {"rows, exposed", 2, {}}};  // as many slots as are planned in two waves
+    for (int y = 0; y < H; y++)
+        for (float moving : {0.f, rate}) all.back().rows.push_back({y, y + 1, moving, 0.f, .5f});
     return all;
 }
 

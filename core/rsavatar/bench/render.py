@@ -156,6 +156,7 @@ def _ratios(taken: Taken, plan: Plan, twin: tuple[float, float] | None) -> list[
         (f"bands-{min(4 * K, H)}", f"bands-{K}"),
         ("scanline", f"bands-{K}"),
         (ONE_PASS, "scanline"),
+        ("bands-all", f"bands-{K}"),
         ("paper", "scanline"),
         (f"bands-{H}", "scanline"),
     ]

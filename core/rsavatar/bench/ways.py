@@ -55,8 +55,11 @@ def scan(height: int, name: str = "scanline", label: str = "scanline", *without:
 def all_ways(height: int, K: int) -> list[Way]:
     """Every way for K source frames per frame: T = 1, the paper's, bands from K to H, and own time step by step.
 
-    The last two are the scanline with one thing changed: a pose node less, or strips of a single row.
+    The last three have one thing changed: bands for which every Gaussian is projected; the scanline with a pose node
+    less, and with strips of a single row.
     """
+    label, everything = f"bands, T = {K}, nothing culled", Options(without=frozenset({"cull"}))
+    unculled = replace(in_bands(height, K), name="bands-all", label=label, bands=0, options=everything)
     fewer = replace(scan(height, "scanline-4", "scanline, four pose nodes"), nodes=4)
     single = replace(scan(height, "scanline-row", "scanline, strips of one row"), options=Options(strip_rows=1))
     finer = sorted({min(T, height) for T in (K, 2 * K, 4 * K, 16 * K, height)})
@@ -67,6 +70,7 @@ def all_ways(height: int, K: int) -> list[Way]:
         scan(height, "own-time", "own time only", "shear", "implicit", "resort"),
         scan(height, "own-time+shear", "+ shear, implicit derivative", "resort"),
         scan(height, "scanline", "+ depth re-sort (scanline)"),
+        unculled,
         fewer,
         single,
     ]
@@ -81,7 +85,8 @@ def compose_whole(scene: Scene) -> Rendering:
     bands = list(zip(images, scene.rows, strict=True))
     rgb = torch.cat([image.rgb[:, r.lo : r.hi] for image, r in bands], 1)
     transmittance = torch.cat([image.transmittance[r.lo : r.hi] for image, r in bands])
-    return Rendering(rgb, transmittance, sum(i.splats for i in images), sum(i.pairs for i in images))
+    counted = (sum(getattr(image, name) for image in images) for name in ("projected", "splats", "pairs", "broken"))
+    return Rendering(rgb, transmittance, *counted)
 
 
 class Exposure:

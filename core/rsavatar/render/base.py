@@ -15,7 +15,8 @@ from torch import Tensor
 
 from rsavatar.geometry.cameras import Camera
 
-Correction = Literal["shear", "implicit", "resort"]  # of own time: footprint, derivative, depth order (reference.py)
+# Of own time: footprint, derivative, depth order (reference.py). And leaving out what cannot reach a slot (cull.cpp).
+Correction = Literal["shear", "implicit", "resort", "cull"]
 
 
 @dataclass(frozen=True)
@@ -59,13 +60,15 @@ class TimedRows:
 class Rendering:
     """An image on black: ``rgb`` [3, H, W] and ``transmittance`` [H, W] (1 where nothing was hit).
 
-    ``splats`` Gaussians survived culling (summed over slots) and made ``pairs`` (splat, strip) pairs; 0 = not counted.
+    ``projected`` Gaussians lay in blocks that might reach a slot, ``splats`` of them survived (both summed over slots)
+    and made ``pairs`` (splat, strip) pairs; 0 = not counted.
     ``broken`` Gaussians had NaN or infinity in them or in their pose: the kernels do not draw them and give them no
     gradient; the twin draws what it may.
     """
 
     rgb: Tensor
     transmittance: Tensor
+    projected: int = 0
     splats: int = 0
     pairs: int = 0
     broken: int = 0
@@ -84,6 +87,7 @@ class Comparison:
 
     loss: Tensor
     squared_error: float
+    projected: int = 0
     splats: int = 0
     pairs: int = 0
     broken: int = 0

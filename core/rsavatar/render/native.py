@@ -19,6 +19,7 @@ from rsavatar.kernels import Target, library, threads
 from rsavatar.render.base import Comparison, Gaussians, Options, Rendering, Scene, TimedRows
 
 _FIELDS = ("means", "rotations", "log_scales", "opacity_logits", "sh", "skin_weights", "screen")
+_COUNTED = ("projected", "splats", "pairs", "broken")
 _Pointer = ctypes.c_void_p
 
 
@@ -60,7 +61,12 @@ class _Options(ctypes.Structure):
 
 
 class _Counters(ctypes.Structure):
-    _fields_ = tuple((name, ctypes.c_int64) for name in ("splats", "pairs", "broken"))
+    _fields_ = tuple((name, ctypes.c_int64) for name in _COUNTED)
+
+    @property
+    def values(self) -> list[int]:
+        """In the order of the fields."""
+        return [getattr(self, name) for name in _COUNTED]
 
 
 _Tensors = tuple[Tensor, ...]  # the seven of ``Gaussians``, and the pose
@@ -75,7 +81,17 @@ class _Static:
     options: Options
 
 
-_FLAGS = {"shear": 1, "implicit": 2, "resort": 4}
+@dataclass(frozen=True)
+class _Seen:
+    """What an image is compared with: contiguous bytes, and how."""
+
+    rgb: Tensor
+    mask: Tensor
+    background: float
+    mask_weight: float
+
+
+_FLAGS = {"shear": 1, "implicit": 2, "resort": 4, "cull": 8}
 _REASONS = {1: "out of memory", 2: "an argument is outside the limits of core/native/layout.h"}
 
 
@@ -128,7 +144,7 @@ class _Render(torch.autograd.Function):
         image = (rgb.data_ptr(), transmittance.data_ptr())
         _draw(ctx, library().rs_render, static, tensors, *image, ctypes.byref(counters))
         ctx.save_for_backward(*tensors, rgb, transmittance)
-        counted = torch.tensor([counters.splats, counters.pairs, counters.broken])
+        counted = torch.tensor(counters.values)
         ctx.mark_non_differentiable(counted)
         return rgb, transmittance, counted
 
@@ -143,13 +159,15 @@ class _RenderL1(torch.autograd.Function):
     """The loss of that image as a function of the same; see ``rs_render_l1``."""
 
     @staticmethod
-    def forward(ctx: Any, static: _Static, target: Target, *tensors: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, static: _Static, seen: _Seen, *tensors: Tensor) -> tuple[Tensor, Tensor]:
         counters, loss, squared = _Counters(), ctypes.c_double(), ctypes.c_double()
         tensors = tuple(t.detach().contiguous() for t in tensors)
+        target = Target(seen.rgb.data_ptr(), seen.mask.data_ptr(), seen.background, seen.mask_weight)
         found = (ctypes.byref(counters), ctypes.byref(loss), ctypes.byref(squared))
         _draw(ctx, library().rs_render_l1, static, tensors, ctypes.byref(target), *found)
+        ctx.seen = seen  # many slots are compared again on the way back
         ctx.save_for_backward(*tensors)
-        others = torch.tensor([squared.value, counters.splats, counters.pairs, counters.broken], dtype=torch.float64)
+        others = torch.tensor([squared.value, *counters.values], dtype=torch.float64)
         ctx.mark_non_differentiable(others)
         return torch.tensor(loss.value, dtype=torch.float64), others
 
@@ -205,9 +223,8 @@ def render_l1(scene: Scene, target: Tensor, mask: Tensor, background: float, mas
     for name, tensor, shape in (("target", target, (3, *size)), ("mask", mask, size)):
         if tensor.dtype != torch.uint8 or tuple(tensor.shape) != shape:
             raise KernelError(expected(name, f"torch.uint8 {shape}", f"{tensor.dtype} {tuple(tensor.shape)}"))
-    target, mask = target.contiguous(), mask.contiguous()
-    compared = Target(target.data_ptr(), mask.data_ptr(), background, mask_weight)
-    loss, others = _apply_l1(_Static(scene.rows, scene.camera, scene.options), compared, *_inputs(scene))
+    seen = _Seen(target.contiguous(), mask.contiguous(), background, mask_weight)
+    loss, others = _apply_l1(_Static(scene.rows, scene.camera, scene.options), seen, *_inputs(scene))
     squared, *counted = others.tolist()
     return Comparison(loss, squared, *map(int, counted))
 

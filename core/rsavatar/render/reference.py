@@ -35,6 +35,7 @@ from rsavatar.render.base import Gaussians, Options, Rendering, Scene, TimedRows
 C0 = 0.28209479177387814  # real spherical harmonics of degree 0 and 1: sqrt(1 / 4 pi) and sqrt(3 / 4 pi)
 C1 = 0.4886025119029199
 NEWTON_STEPS = 8
+LEAST_SLACK = 0.1
 TILE_COLUMNS = 64  # bounds the memory of one [splats, rows, columns] block; no effect on the result
 
 
@@ -126,14 +127,14 @@ def project(gaussians: Gaussians, pose: Tensor, rows: TimedRows, camera: Camera,
     if rows.rate != 0 and "implicit" not in options.without:
         at_root = _pose(coefficients, gaussians.means, tau, camera, options)
         residual = tau - (rows.rate * at_root.v + rows.start)
-        step = residual / (1 - rows.rate * at_root.v_rate).detach()
+        step = residual / _slack(rows.rate, at_root.v_rate).detach()
         tau = torch.where(tau.abs() < 1, tau - step, tau)  # value unchanged; derivative of the implicit function
     posed = _pose(coefficients, gaussians.means, tau, camera, options)
     moving = 0.0 if "shear" in options.without else rows.rate
     return Splats(
         u=posed.u + gaussians.screen[0],
         v=posed.v + gaussians.screen[1],
-        conic=_shear(_conic(gaussians, posed, camera, options), moving * posed.u_rate, moving * posed.v_rate),
+        conic=_shear(_conic(gaussians, posed, camera, options), moving * posed.u_rate, _slack(moving, posed.v_rate)),
         opacity=gaussians.opacity_logits.sigmoid(),
         colour=_colour(gaussians.sh, posed.world, camera),
         depth=posed.local[:, 2],
@@ -219,10 +220,16 @@ def _conic(gaussians: Gaussians, posed: Posed, camera: Camera, options: Options)
     return torch.stack([squares[1] + eps, -(k1 * k2).sum(-1), squares[0] + eps]) / determinant
 
 
-def _shear(conic: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """The conic [3, M] of a splat that moves by (a, b) pixels per row while it is scanned."""
+def _slack(rate: float, v_rate: Tensor) -> Tensor:
+    """1 - rate dv/dtau [M], held at ``LEAST_SLACK``: near scan speed, first-order terms over it hold no longer."""
+    slack = 1 - rate * v_rate
+    return torch.where(slack.abs() < LEAST_SLACK, torch.where(slack < 0, -LEAST_SLACK, LEAST_SLACK), slack)
+
+
+def _shear(conic: Tensor, a: Tensor, slack: Tensor) -> Tensor:
+    """The conic [3, M] of a splat that moves by (a, 1 - slack) pixels per row while it is scanned."""
     A, B, C = conic
-    return torch.stack([A, (1 - b) * B - a * A, a * a * A - 2 * a * (1 - b) * B + (1 - b) ** 2 * C])
+    return torch.stack([A, slack * B - a * A, a * a * A - 2 * a * slack * B + slack**2 * C])
 
 
 def _colour(sh: Tensor, world: Tensor, camera: Camera) -> Tensor:
