@@ -56,11 +56,11 @@ struct Hit {
 };
 
 // Takes a splat's alpha off the transmittance at t; false where no pixel is reached. A pixel whose transmittance would fall
-// under the minimum stops: its T turns negative, so that `after` stays under the minimum for all that comes behind.
+// under the minimum stops: its T turns negative, and nothing that comes behind reaches it.
 static inline bool step(Floats power, float *t, const Limits &limits, Hit &hit) {
-    Ints reached = power >= limits.cut;
-    if (!any(reached)) return false;
     Floats T = load(t);
+    Ints reached = (power >= limits.cut) & (T > 0.f);
+    if (!any(reached)) return false;
     hit.raw = exp2(power);
     Floats alpha = keep(reached, minimum(hit.raw, limits.alpha_max)), weight = T * alpha, after = T - weight;
     Ints live = after >= limits.transmittance_min;

@@ -62,8 +62,6 @@ REASONS = {  # why a target is missed, by how its name starts
     "busy machine moves this ratio, too.",
     "memory, last training step": "Most of it comes before step 500; a leak would grow evenly. "
     "The cause was not found.",
-    "peak memory, bands": "Every band keeps its splats and their moments for the way back: 170 000 of them where a "
-    "band is a row, 13 000 in one whole image. Projecting them again instead was not tried.",
     "torch twin": "Other tenants of the machine move both, and not together: 400 to 580 in runs of this bench.",
 }
 
