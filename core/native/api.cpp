@@ -31,7 +31,7 @@ static bool acceptable(const RsRows *rows, int slots, int height) {
 // one whole image; of more, nothing is kept, and they are planned again. So memory does not grow with the slots.
 constexpr int WAVE = 64;
 
-static void share_out(RsFrame &frame) {
+static void split_into_waves(RsFrame &frame) {
     const int slots = frame.rows.size();
     frame.waves.assign(1, 0);
     for (int t = 1; t < slots; t++)
@@ -94,7 +94,7 @@ static bool begin(RsFrame &frame, const RsGaussians &g, int slots, int coefficie
                   const RsOptions &options) {
     if (!acceptable(g, slots, coefficients, camera, options) || !acceptable(rows, slots, camera.height)) return false;
     frame.camera = camera, frame.options = options, frame.coefficients = coefficients, frame.rows.assign(rows, rows + slots);
-    share_out(frame), surround(frame, g);
+    split_into_waves(frame), surround(frame, g);
     return true;
 }
 

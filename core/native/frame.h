@@ -1,4 +1,4 @@
-// One image's plan, as the stages hand it on: project -> bin -> raster, and back.
+// One image's plan, as the stages hand it on: cull -> project -> bin -> raster, and back.
 #pragma once
 #include <atomic>
 #include <new>

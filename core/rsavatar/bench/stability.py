@@ -108,6 +108,7 @@ def page(rows: list[Row], machine: Machine) -> str:
         "",
         "Float32 kernels against their float64 twin, and training, at their worst.",
         f"Written by `{COMMAND} --json docs/benchmarks/stability.json`; `stability.json` has the same rows as data.",
+        "The last row's steps are 3000, or what RSAVATAR_STABILITY_STEPS says.",
         "",
         f"**{_summary(rows)}**",
         "",
