@@ -158,17 +158,21 @@ def _memory(plan: Plan) -> list[Curve]:
     return [
         Curve(axis="memory", name="bands", fixed=fixed, points=bands),
         Curve(axis="memory", name="scanline", fixed=fixed, points=flat),
-        _memory_of_steps(plan),
+        *_memory_of_steps(plan),
     ]
 
 
-def _memory_of_steps(plan: Plan) -> Curve:
+def _memory_of_steps(plan: Plan) -> list[Curve]:
     """Memory of a process by the number of training steps that it has taken."""
     narrate("memory over training steps")
-    grown = training_mb(plan.size, plan.memory_steps)
-    points = [Point(x=steps, memory_mb=mb) for steps, mb in zip(plan.memory_steps, grown, strict=True)]
+    held = training_mb(plan.size, plan.memory_steps)
     fixed = f"the whole process, {plan.size.gaussians} Gaussians, {plan.size.pixels} x {plan.size.pixels} px"
-    return Curve(axis="steps", name="training", fixed=fixed, points=points)
+
+    def curve(name: str, taken: list[float]) -> Curve:
+        points = [Point(x=steps, memory_mb=mb) for steps, mb in zip(plan.memory_steps, taken, strict=True)]
+        return Curve(axis="steps", name=name, fixed=fixed, points=points)
+
+    return [curve("resident", [h.resident for h in held]), curve("in use", [h.in_use for h in held])]
 
 
 def _frames(plan: Plan) -> Curve:
@@ -204,7 +208,8 @@ def _targets(steps: dict[str, list[float]], ratios: list[Ratio], curves: list[Cu
     if memory:
         whole, most = memory["bands"][0], memory["bands"][-1]
         found.append(Target.at_most(1.2, memory["scanline"][0] / whole, "peak memory, scanline / one whole image"))
-        held = [p.memory_mb or 0.0 for c in curves if c.axis == "steps" for p in c.points]
-        found.append(Target.at_most(1.02, held[-1] / held[0], "memory, last training step / 200th"))
+        held = {c.name: [p.memory_mb or 0.0 for p in c.points] for c in curves if c.axis == "steps"}
+        for name, taken in held.items():
+            found.append(Target.at_most(1.02, taken[-1] / taken[0], f"memory {name}, last training step / 200th"))
         found.append(Target.at_most(1.2, most / whole, "peak memory, bands T = H / one whole image"))
     return found

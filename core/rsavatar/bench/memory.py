@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
+import math
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -27,26 +30,50 @@ def render_mb(size: Size, bands: int | None) -> float:
     return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
 
-def training_mb(size: Size, steps: Sequence[int]) -> list[float]:
-    """MB of resident memory of a process that trains, after each number of ``steps`` (rising)."""
+@dataclass(frozen=True)
+class Held:
+    """MB of a process: resident, and in use, which is what its allocator has handed out."""
+
+    resident: float
+    in_use: float
+
+
+def training_mb(size: Size, steps: Sequence[int]) -> list[Held]:
+    """Memory of a process that trains, after each number of ``steps`` (rising)."""
     arguments = [str(size.gaussians), str(size.pixels), "train", *map(str, steps)]
     command = [sys.executable, "-m", __name__, *arguments]
-    return [float(x) for x in subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()]
+    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    return [Held(*map(float, line.split())) for line in told.splitlines()]
 
 
-def _train(size: Size, steps: Sequence[int]) -> list[float]:
+class _MallocInfo(ctypes.Structure):
+    """glibc's ``struct mallinfo2``: bytes in use are at 4 (mapped) and 7 (of the heap)."""
+
+    _fields_ = (("sizes", ctypes.c_size_t * 10),)
+
+
+def _in_use() -> float:
+    """Bytes handed out by malloc; not a number where the C library is not glibc 2.33 or newer."""
+    ask = getattr(ctypes.CDLL(None), "mallinfo2", None)
+    if ask is None:
+        return math.nan
+    ask.restype = _MallocInfo
+    sizes = ask().sizes
+    return float(sizes[4] + sizes[7])
+
+
+def _train(size: Size, steps: Sequence[int]) -> None:
     from rsavatar.bench.training import Training  # it imports much that a render does without
 
     torch.set_num_threads(1)
     kernels.keep_memory()
-    training, found = Training(size, scan(size.pixels)), []
+    training = Training(size, scan(size.pixels))
     for step in range(1, max(steps) + 1):
         training.step()
         if step % BLOCK == 0:
             training.refresh()
         if step in steps:
-            found.append(_status("VmRSS") / MB)
-    return found
+            print(_status("VmRSS") / MB, _in_use() / MB)
 
 
 def _measure(size: Size, bands: int) -> float:
@@ -71,4 +98,4 @@ def _status(name: str) -> float:
 
 if __name__ == "__main__":
     of, what = Size(int(sys.argv[1]), int(sys.argv[2])), sys.argv[3]
-    print(*_train(of, [int(n) for n in sys.argv[4:]])) if what == "train" else print(_measure(of, int(what)))
+    _train(of, [int(n) for n in sys.argv[4:]]) if what == "train" else print(_measure(of, int(what)))
