@@ -10,7 +10,7 @@ from rsavatar.bench.results import Curve, GrowthResult, RenderResult, WayFigures
 from rsavatar.bench.tables import AXES, MEASURES
 
 INK, GREY, BLUE, ORANGE, GREEN = "#222222", "#8a8a8a", "#2f6db3", "#d9772b", "#2c8f5c"
-COLOURS = {"bands": BLUE, "the paper's way": GREEN, "scanline, 1 thread": GREY}  # of curves; others are scanlines
+COLOURS = {"bands": BLUE, "in use": BLUE, "the paper's way": GREEN, "scanline, 1 thread": GREY}  # others: scanlines
 STEPS: dict[str, tuple[str, tuple[int, int], str]] = {  # of own time: label, its shift in points, its alignment
     "own-time": ("own time", (-6, 0), "right"),
     "own-time+shear": ("+ shear", (-6, 0), "right"),

@@ -100,7 +100,7 @@ def _of_growth(result: GrowthResult) -> list[TextTable]:
     ]
 
 
-MEASURES = {"forward_ms": "fwd ms", "total_ms": "fwd+bwd ms", "step_ms": "training step ms", "memory_mb": "peak MB"}
+MEASURES = {"forward_ms": "fwd ms", "total_ms": "fwd+bwd ms", "step_ms": "training step ms", "memory_mb": "memory MB"}
 
 
 def _curve(curve: Curve) -> TextTable:
