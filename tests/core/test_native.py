@@ -139,6 +139,38 @@ def test_blocks_that_cannot_reach_a_slot_are_left_out_without_a_trace(kind: str)
     assert image.projected < 0.9 * whole.projected  # half of the slots of "rows" scan, and are not culled
 
 
+def beyond_the_hull(s: Scene) -> Scene:
+    """Weights 2 and -1 of two joints that are 40 cm apart: the mean is outside of what either makes of it."""
+    weights, pose = torch.zeros_like(s.gaussians.skin_weights), s.pose.clone()
+    weights[0], weights[1] = 2.0, -1.0
+    pose[:, 0, 1, 1, 3] += 0.4
+    return replace(s, gaussians=replace(s.gaussians, skin_weights=weights), pose=pose)
+
+
+def off_one(s: Scene) -> Scene:
+    return replace(s, gaussians=replace(s.gaussians, skin_weights=1.5 * s.gaussians.skin_weights))
+
+
+def broken_joint(s: Scene) -> Scene:
+    pose = s.pose.clone()
+    pose[1, 0, 3, 1, 3] = torch.nan
+    return replace(s, pose=pose)
+
+
+def at_the_camera(s: Scene) -> Scene:
+    pose = s.pose.clone()
+    pose[..., 2, 3] -= 2.3
+    return replace(s, pose=pose)
+
+
+@pytest.mark.parametrize("change", [beyond_the_hull, off_one, broken_joint, at_the_camera], ids=lambda f: f.__name__)
+def test_blocks_that_nothing_bounds_are_not_left_out(change: Callable[[Scene], Scene]) -> None:
+    s = change(scenes.orderly(scenes.scene("bands", count=400, dtype=torch.float32)))
+    image, whole = native.render(s), native.render(replace(s, options=Options(without=frozenset({"cull"}))))
+    assert torch.equal(image.rgb, whole.rgb)
+    assert (image.splats, image.broken) == (whole.splats, whole.broken)
+
+
 @pytest.mark.parametrize("speed", [0.5, 0.95, 1.05, 2.0], ids="{} of scan speed".format)
 def test_motion_near_scan_speed_equals_the_twin(speed: float) -> None:
     falling = scenes.orderly(scenes.scene("scanline", count=60))
