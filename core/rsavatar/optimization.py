@@ -215,7 +215,7 @@ class State:
         return rejected
 
     def set_rates(self, settings: Settings) -> None:
-        """What places the body falls to a hundredth of its first rate, log-linearly over the run."""
+        """Means, motion, pose network and clock fall to a hundredth of their first rate, log-linearly over the run."""
         decay = 0.01 ** (self.step / settings.iterations)
         for group in self.optimizer.param_groups:
             if group["name"] in ("means", "motion", "pose_residual", "clock"):

@@ -13,7 +13,7 @@ from torch import Tensor
 from rsavatar import kernels
 from rsavatar.bench import growth, page, render, results, tables
 from rsavatar.bench.accuracy import compare, errors
-from rsavatar.bench.memory import MB, render_mb
+from rsavatar.bench.memory import MB, render_mb, training_mb
 from rsavatar.bench.results import GrowthResult, RenderResult, Target
 from rsavatar.bench.scene import READOUT, MovingBody, Size, build, longest_path
 from rsavatar.bench.timing import interleave, ratio
@@ -152,6 +152,12 @@ def test_a_target_knows_its_side() -> None:
 def test_memory_of_a_render_holds_at_least_its_image() -> None:
     pixels = 400
     assert 4 * 4 * pixels**2 / MB < render_mb(replace(SIZE, pixels=pixels), None) < 100
+
+
+def test_memory_of_a_training_is_resident_and_in_part_in_use() -> None:
+    held = training_mb(Size(gaussians=200, pixels=64), (1, 2))
+    assert len(held) == 2
+    assert all(1 < h.in_use < h.resident for h in held)
 
 
 def test_render_and_growth_end_in_a_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

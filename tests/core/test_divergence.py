@@ -34,6 +34,17 @@ def test_a_block_far_above_the_best_is_divergence_and_one_below_the_limit_is_not
         state.close_block(actor)
 
 
+def test_what_places_the_body_settles_by_the_end_of_a_run() -> None:
+    how = settings(case())
+    state = State(build_actor(RollingShutterAvatar(), case()), how)
+    state.step = how.iterations
+    state.set_rates(how)
+    left = {group["name"]: group["lr"] / group["initial"] for group in state.optimizer.param_groups}
+    settled = {name for name, share in left.items() if share == pytest.approx(0.01)}
+    assert settled == {"means", "motion", "pose_residual"}
+    assert all(left[name] == 1.0 for name in left.keys() - settled)
+
+
 def test_a_parameter_that_is_no_number_is_named() -> None:
     job = case()
     actor = build_actor(RollingShutterAvatar(), job)

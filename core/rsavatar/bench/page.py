@@ -60,9 +60,9 @@ REASONS = {  # why a target is missed, by how its name starts
     "seeds and the pixels off.",
     "training step, the paper": "What is not rendering (poses, networks, loss, optimiser) costs both ways the same. A "
     "busy machine moves this ratio, too.",
-    "memory resident, last training step": "Free pieces of the heap: what is in use does not grow. Large blocks of a "
-    "refresh of the skinning network find no piece that is long enough, a few times in the first thousand steps.",
-    "torch twin": "Other tenants of the machine move both, and not together: 400 to 580 in runs of this bench.",
+    "memory resident, last training step": "Free pieces of the heap: what is in use does not grow. Which blocks find "
+    "no piece that is long enough, a few times in the first thousand steps, was not looked for.",
+    "torch twin": "Other tenants of the machine move both, and not together: 385 to 580 in runs of this bench.",
 }
 
 

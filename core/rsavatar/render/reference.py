@@ -10,7 +10,8 @@ An image is rendered slot by slot (``TimedRows``). For a slot whose row y is exp
    denominator is held constant has exactly that derivative, and leaves the value where it is.
 3. **Shear.** Inside its footprint the Gaussian goes on moving: the row dy below the mean is exposed rate dy later, when
    the mean has moved by (a, b) dy, a = rate u', b = rate v'. With dx' = dx - a dy and dy' = (1 - b) dy the exponent
-   A dx'^2 + 2 B dx' dy' + C dy'^2 is again a quadratic form in (dx, dy): only the conic changes.
+   A dx'^2 + 2 B dx' dy' + C dy'^2 is again a quadratic form in (dx, dy): only the conic changes. Near scan speed, where
+   first order no longer holds, 1 - b is held at ``LEAST_SLACK`` here and in the derivative of 2.
 4. **Depth order.** Gaussians are posed at different instants, so each row orders them by their depths extrapolated to
    the row's own instant.
 5. **Composite.** Front to back, alpha blending with 3D Gaussian splatting's cutoffs (``Options``).
@@ -35,7 +36,7 @@ from rsavatar.render.base import Gaussians, Options, Rendering, Scene, TimedRows
 C0 = 0.28209479177387814  # real spherical harmonics of degree 0 and 1: sqrt(1 / 4 pi) and sqrt(3 / 4 pi)
 C1 = 0.4886025119029199
 NEWTON_STEPS = 8
-LEAST_SLACK = 0.1
+LEAST_SLACK = 0.1  # as the kernels': docs/decisions/0019
 TILE_COLUMNS = 64  # bounds the memory of one [splats, rows, columns] block; no effect on the result
 
 
